@@ -42,6 +42,7 @@ class PiGcsSettings:
     figures: StageFigures
     wiring: Wiring = field(default=Wiring())
     axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
+    serial: str | None = key(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
     trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
     reference: Reference = key(Reference.SWITCH, "What the search for the reference goes to.")
     first_pulse: PiFirstPulse = key(

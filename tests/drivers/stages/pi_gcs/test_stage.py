@@ -36,7 +36,7 @@ def test_opening_asks_who_it_is_switches_the_servo_on_and_the_trigger_off(rig: R
     rig.open()
     assert rig.sent() == [
         "*IDN?", "CSV?", "SAI?", "#5", "SPA? 1 0xE", "SPA? 1 0xF", "TRO 2 0", "TRO? 2", "SVO? 1", "SVO 1 1", "SVO? 1",
-        "ACC 1 60", "ACC? 1", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
+        "VEL? 1", "SPA? 1 0xB", "ACC 1 60", "ACC? 1", "SPA? 1 0xC", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
     ]  # fmt: skip
     assert (rig.say("SVO?"), rig.say("TRO? 2")) == ("1=1", "2=0")
 
