@@ -34,8 +34,8 @@ TRIES = 3  # exposures of a view whose stage is not at its angle, after which th
 STANDS_WITHIN = 10.0  # s that a stage which somebody else moves may take to stand, before it is sent to a view again
 ASTRAY_ADVICE = (
     f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
-    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early that a "
-    "move is done"
+    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
+    "that a move is done"
 )
 NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 

@@ -53,6 +53,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
+from drivers.stages.shared import FOUND
 
 SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
 
@@ -159,6 +160,9 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             sink = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
+            for device, said in ready.info.devices.items():
+                if found := said.get(FOUND):
+                    sink(Warned(f"{device}: before it was opened: {found}."))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan

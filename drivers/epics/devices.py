@@ -248,7 +248,7 @@ class PvMonochromator:
             self._stopper.write("", 1)
 
     def remember_place(self) -> Callable[[], str]:
-        """See `drivers.base.protocols.Rechecked`. It may leave its tolerance for less than `settle`, as after a move."""
+        """See `drivers.base.protocols.Rechecked`. It may be off for less than `settle`, as after a move."""
         before = self.energy()
 
         def moved() -> str:

@@ -25,9 +25,9 @@ class SettingsStore(Protocol):
 class RestoresSettings(Protocol):
     """A stage that changes settings of its controller, and restores them when it is closed."""
 
-    def keep_found_settings(self, store: SettingsStore) -> str:
+    def keep_found_settings(self, store: SettingsStore) -> None:
         """From now on they are in `store`, too. Those of an earlier program that died are restored at the end instead
-        of what it left; the sentence returned says so, "" if there are none."""
+        of what it left, and `describe` says so."""
 
 
 class FoundSettings:
@@ -35,19 +35,20 @@ class FoundSettings:
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
+        self.said = ""
+        """What an earlier program left, in words; "" if it restored all."""
         self._store: SettingsStore | None = None
 
-    def keep_in(self, store: SettingsStore) -> str:
+    def keep_in(self, store: SettingsStore) -> None:
         """See `RestoresSettings.keep_found_settings`."""
         earlier = {name: value for name, value in store.load().items() if name in self.values}
         left = {name: self.values[name] for name, value in earlier.items() if self.values[name] != value}
         self.values |= earlier
         store.save(self.values)
         self._store = store
-        if not left:
-            return ""
-        said = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in left.items())
-        return f"a program that was killed had left {said}: what stood before it is restored at the end"
+        if left:
+            said = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in left.items())
+            self.said = f"a program that was killed left {said}; what stood there before is restored at the end"
 
     def restore(self, write: Callable[[str, str], object]) -> None:
         """Write each of them back, once. The store keeps them if one is not taken."""

@@ -89,8 +89,9 @@ FOUND = "found_at_opening"
 """Key of a description: what a controller said of the time before it was opened, which opening has cleared."""
 
 
-def found_at_opening(said: str) -> dict[str, str]:
-    """The entry of a description; none if there is nothing to say."""
+def found_at_opening(*sentences: str) -> dict[str, str]:
+    """The entry of a description; none if all sentences are empty."""
+    said = "; ".join(filter(None, sentences))
     return {FOUND: said} if said else {}
 
 

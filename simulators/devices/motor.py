@@ -175,7 +175,7 @@ class PulseMotor:
         self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
 
     def disturb(self, beyond: Callable[[float], float]) -> None:
-        """From now on `beyond` (counts at a time in s) turns it beyond its place, and no status tells; a move ends it."""
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
         self._replace(replace(self.move, beyond=beyond))
 
     def start(self, target: int, speed: float, acceleration: float) -> None:

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from drivers.base.errors import DeviceRefused
+from drivers.stages.kept import FoundSettings
 from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
 from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.kept import FoundSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
 from drivers.stages.shared import while_it_moves
 

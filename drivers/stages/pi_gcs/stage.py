@@ -14,8 +14,8 @@ from fractions import Fraction
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.kept import SettingsStore
+from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, MOTION, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
@@ -142,7 +142,7 @@ class PiGcsStage(LineStage):
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **({"serial": self._serial} if self._serial else {}),
-            **found_at_opening(meaning(self._axis.error_at_opening)),
+            **found_at_opening(meaning(self._axis.error_at_opening), self._axis.found.said),
             **self._travel.described(),
         }
 
@@ -158,8 +158,8 @@ class PiGcsStage(LineStage):
                 self._axis.restore()
         self._line.close()
 
-    def keep_found_settings(self, store: SettingsStore) -> str:
-        return self._axis.found.keep_in(store)
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._axis.found.keep_in(store)
 
     def _refuse_untold(self) -> None:
         """DeviceError, once, for what happened to the standing axis since its last move."""

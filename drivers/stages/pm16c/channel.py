@@ -21,7 +21,7 @@ COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 ERRORS = {0x2: "a move was refused because its pulse chip was busy", 0x4: "a move to a wrong place was refused"}
-"""Error flags that tell of the motor; the other, of an unknown command, is set by the empty line of every opening, too."""
+"""Error flags that tell of the motor; that of an unknown command is set by the empty line of every opening, too."""
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
 

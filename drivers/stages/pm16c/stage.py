@@ -122,7 +122,7 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
-            **found_at_opening(self._channel.error_at_opening),
+            **found_at_opening(self._channel.error_at_opening, self._channel.found.said),
             **self._travel.described(),
         }
 
@@ -132,8 +132,8 @@ class PM16CStage(LineStage):
             with contextlib.suppress(DeviceError):  # a dead line is closed, too
                 self._channel.close()
 
-    def keep_found_settings(self, store: SettingsStore) -> str:
-        return self._channel.found.keep_in(store)
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._channel.found.keep_in(store)
 
     def _send_stop(self, hard: bool) -> str:
         if (search := self._search) is not None:

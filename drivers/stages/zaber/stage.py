@@ -243,7 +243,7 @@ class ZaberStage(LineStage):
         self._pulses.disarm()
 
     def describe(self) -> dict[str, str | int | float]:
-        pulses = self._pulses.settings
+        pulses, flags = self._pulses.settings, meaning_of(self._axis.flags_at_opening)
         return {
             "model": f"Zaber device {self._identity.number}",
             "serial": self._identity.serial,
@@ -255,7 +255,7 @@ class ZaberStage(LineStage):
             "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            **found_at_opening("" if (flags := meaning_of(self._axis.flags_at_opening)) is None else flags.text),
+            **found_at_opening("" if flags is None else flags.text, self._axis.found.said),
             **self._travel.described(),
         }
 
@@ -272,8 +272,8 @@ class ZaberStage(LineStage):
             with contextlib.suppress(DeviceError):
                 self._axis.close()
 
-    def keep_found_settings(self, store: SettingsStore) -> str:
-        return self._axis.found.keep_in(store)
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._axis.found.keep_in(store)
 
     def _refuse_untold(self, status: ZaberAxisStatus) -> None:
         """DeviceError, once, for what happened to the standing stage since its last move."""

@@ -155,7 +155,7 @@ class GcsAxis:
                 self._at_end = act
 
     def disturb(self, beyond: Callable[[float], float]) -> None:
-        """From now on `beyond` (counts at a time in s) turns it beyond its place, and no status tells; a move ends it."""
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
         self._moves[-1] = replace(self.move, beyond=beyond)
 
     def reference(self, kind: str) -> None:

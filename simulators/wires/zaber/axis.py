@@ -100,7 +100,7 @@ class SimulatedZaberAxis:
         return sorted(standing, key=PRIORITY.index)
 
     def disturb(self, beyond: Callable[[float], float], *flags: str) -> None:
-        """From now on `beyond` (counts at a time in s) turns it beyond its place, and only these flags tell; a move ends it."""
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place; only these flags tell."""
         self._moves[-1] = replace(self.move, beyond=beyond)
         self.flags.update(flags)
 

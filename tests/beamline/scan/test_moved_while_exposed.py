@@ -196,7 +196,7 @@ def test_the_pairs_of_align_are_looked_at_too(stage: str, times: int) -> None:
 
 @every_kind
 def test_a_stage_that_stands_is_asked_twice_more_a_view_and_nothing_else_changes(stage: str, tmp_path: Path) -> None:
-    result, error, events, path = scanned(stage, touched, tmp_path, 0)
+    result, error, events, _ = scanned(stage, touched, tmp_path, 0)
     assert error is None and result is not None and result.n_frames == 4 + VIEWS
     assert not [event for event in events if event.event == "warning"]
 
