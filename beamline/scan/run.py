@@ -43,7 +43,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_sho
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
-from beamline.scan.resume import ResumableRun
+from beamline.scan.resume import ResumableRun, other_devices
 from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, Supervision
@@ -149,6 +149,7 @@ def run_scan(
         instrument.watch_moves(stop.refuse_abort)
         ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
+        others = [] if series else other_devices(place, ready)
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
             try:
@@ -163,6 +164,8 @@ def run_scan(
             for device, said in ready.info.devices.items():
                 if found := said.get(FOUND):
                     sink(Warned(f"{device}: before it was opened: {found}."))
+            for sentence in others:
+                sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -289,7 +290,8 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         assert stage.position() < 2.9  # it was on its way to 3
         stage.close()
     assert (served.values.get("blade", 0.0), served.values["M.STOP"], served.values["F.STOP"]) == (0.0, 1.0, 1.0)
-    stopped, shutter, mover, changer, crystal, disarmed = said
+    stopped, shutter, mover, changer, crystal, left, disarmed = said
+    assert re.match(r"stage: a program that was killed left \.VELO 28\.6\d+ for 1\.0", left)
     assert (crystal, served.values["E.STOP"]) == ("The monochromator was told to stop.", 1.0)
     assert changer == "The filter was told to stop."
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")
