@@ -1,8 +1,8 @@
 """Locks on files: ours on a file that is written, and HDF5's, where they fail.
 
 Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
-however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read whole. On a
-file system without locks (many NFS mounts) that fails.
+however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read
+whole. On a file system without locks (many NFS mounts) that fails.
 """
 
 from __future__ import annotations

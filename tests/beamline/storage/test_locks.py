@@ -107,7 +107,8 @@ def test_a_file_that_is_held_is_named_as_held(shim: Path, command: str, finished
 def test_a_file_that_another_program_has_open_to_write(tmp_path: Path) -> None:
     path = tmp_path / "theirs.h5"
     code = (
-        "import sys, h5py; file = h5py.File(sys.argv[1], 'w'); file['a'] = 1; file.flush(); print('ready', flush=True); "
+        "import sys, h5py; file = h5py.File(sys.argv[1], 'w'); file['a'] = 1; file.flush(); "
+        "print('ready', flush=True); "
         "sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -137,7 +138,7 @@ config = load(template, ["scan.mode=step"], {})
 for number in ("37", "95"):
     os.environ["FLOCK_FAILS"] = number
     assert "has no file locks (errno " + number in dry_run(config, folder).timeline.violations[-1]
-    assert locks(folder).grade == "failed", locks(folder)
+    assert locks(folder).verdict == "failed", locks(folder)
     try:
         NXtomoWriter(folder / "scan.h5", ScanInfo(sample="s"), (8, 12), clock=SystemClock())
     except DataError as error:
