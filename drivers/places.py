@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -70,14 +71,31 @@ class PlacedStage:
             problem = f"{self._places.failed} {place}: {cause.device}: {cause.problem}"
             raise cause.told_by(self.name, problem, advice=advice) from cause
 
+    def remember_place(self) -> Callable[[], str]:
+        """See `drivers.base.protocols.Rechecked`."""
+        before = self._stage.position()
+
+        def moved() -> str:
+            if self._stands_at(before):
+                return ""
+            now, place = self._stage.position(), self.place()
+            named = f" ({place})" if place else ""
+            return f"it stood at {math.degrees(before):.4f} deg, and is at {math.degrees(now):.4f} deg{named}"
+
+        return moved
+
     def close(self) -> None:
         """It stays where it is."""
         self._stage.close()
 
     def _is_at(self, place: str) -> bool:
+        return self._stands_at(self._places.places[place])
+
+    def _stands_at(self, angle: float) -> bool:
+        """Within the tolerance that the stage's own moves arrive with."""
         stage = self._stage
-        there = stage.to_counts(stage.position()) == stage.to_counts(self._places.places[place])
-        return there and not stage.moving()
+        away = stage.to_counts(stage.position()) - stage.to_counts(angle)
+        return abs(away) <= stage.limits.tolerance and not stage.moving()
 
 
 class StageSampleMover:
@@ -85,6 +103,7 @@ class StageSampleMover:
 
     def __init__(self, motor: PlacedStage) -> None:
         self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
+        self.remember_place = motor.remember_place
 
     def out(self) -> None:
         """Raises DeviceError: the sample did not arrive."""

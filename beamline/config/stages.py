@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import Field, model_validator
 
+from beamline.config.found_settings import keep_found_settings
 from beamline.config.section import Section, declared, read_from, section_of
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
@@ -41,8 +42,11 @@ class StageSection(Section):
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
-        """Its driver, connected at the port, or at `url`; see `StageDriver`."""
-        return STAGES[self.kind](url or self.port, self.settings, clock)
+        """Its driver, connected at the port, or at `url`; see `StageDriver`. A real one's settings are kept on disk."""
+        stage = STAGES[self.kind](url or self.port, self.settings, clock)
+        if not (url or self.port).lower().startswith("sim://"):
+            keep_found_settings(stage)
+        return stage
 
     def halt(self, clock: Clock) -> None:
         """Stop it; see `StageDriver`."""

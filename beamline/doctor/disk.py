@@ -20,13 +20,14 @@ from beamline.doctor.check import Diagnosis, Grade
 from beamline.plan.limits import ROOM as MARGIN
 from beamline.scan.preflight import DryRun, disk_of
 from beamline.scan.recorder import room as waiting_room
+from beamline.storage.writer_lock import no_locks
 from drivers.base.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30  # Longest time (s on the clock) and most bytes of a measurement
 PIECE = 16 << 20  # Bytes that are written and synchronised together
 LEAST = 4 * PIECE  # Fewer bytes give no reliable rate
 COMFORT = 1.25  # A disk faster than the need by this factor is good; a slower one may be disturbed by other programs
-SPEED, ROOM = "disk speed", "disk space"
+SPEED, ROOM, LOCKS = "disk speed", "disk space", "file locks"
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,15 @@ def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = te
     found += f" {size(backlog)} would have to wait {there_is_room}"
     advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
     return said(Grade.FAILED, found, advice=advice, values=values)
+
+
+def locks(folder: Path) -> Diagnosis:
+    """Whether files can be locked where the scan's file will be, as HDF5 wants."""
+    there = disk_of(folder)
+    if said := no_locks(there):
+        cause, _, advice = said.partition("; ")
+        return Diagnosis(LOCKS, Grade.FAILED, f"{cause[0].upper()}{cause[1:]}.", "a disk with file locks", advice)
+    return Diagnosis(LOCKS, Grade.OK, f"Files in {there} can be locked.")
 
 
 def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:

@@ -61,6 +61,7 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
         yield from _monochromator(config.devices.monochromator, clock)
     folder = Path((StorageSection() if config is None else config.storage).folder)
     yield disk.room(folder, need)
+    yield disk.locks(folder)
     yield disk.speed(folder, need, clock)
     yield memory(free_memory(), need)
 

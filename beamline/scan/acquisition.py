@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 
@@ -10,10 +11,10 @@ import numpy as np
 from beamline.core.errors import BeamlineError, DataError, InstrumentError, ReferencesError, ScanStopped
 from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
-from beamline.core.text import spans
+from beamline.core.text import count, spans
 from beamline.plan.plan import Block, Timeline
 from beamline.plan.retake import middle_of_exposure, retake_block, return_triggers
-from beamline.scan.exposures import SLICE, Exposures, Taken
+from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, Exposures, Taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.references import REFERENCES
 from beamline.scan.states import State
@@ -21,8 +22,9 @@ from beamline.scan.supervision import Supervision
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind
-from drivers.base.protocols import CameraSettings, Devices
+from drivers.base.protocols import CameraSettings, Devices, Rechecked
 
+NAMED = 5  # views that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 
@@ -150,7 +152,11 @@ class Acquisition:
         self._sink(BlockStarted(*what, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
         self._set_shutter_and_sample(block.kind)
-        yield from self._exposures.take(block, self.n_frames, taken)
+        first, looks = self.n_frames, self._remembered_places(block.kind)
+        yield from self._exposures.take(block, first, taken)
+        self._require_in_place(looks, block.kind, range(first, self.n_frames))
+        if len(taken.astray) > 1:
+            self._sink(Warned(_astray(block, taken)))
         if block.kind is FrameKind.FLAT:
             self._devices.sample.back()
         self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
@@ -167,12 +173,17 @@ class Acquisition:
         for frame in self._block(done):
             i = frame.trigger
             angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + i
+            if frame.kind is FrameKind.INVALID:
+                yield replace(frame, trigger=trigger)
+                continue
             if row < 0:
                 trigger = retakes[i].trigger
                 if trigger in taken.missing:
                     taken.missing.remove(trigger)
                     self.recovered += 1
-            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, frame.replaces))
+            rows_astray = [astray_row for astray_row, _ in done.taken.astray.get(i, [])]
+            earlier = -1 if frame.replaces in rows_astray else frame.replaces
+            yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, earlier))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were taken again."))
 
@@ -182,7 +193,8 @@ class Acquisition:
         beyond = middle_of_exposure(views)[return_triggers(views, block.n)]
         done = TakenBlock(block, Taken(), again=True)
         for frame in self._block(done):
-            yield replace(frame, angle=frame.angle - float(beyond[frame.trigger]))
+            invalid = frame.kind is FrameKind.INVALID
+            yield frame if invalid else replace(frame, angle=frame.angle - float(beyond[frame.trigger]))
         if done.taken.missing:
             self._sink(Warned(f"Of {block.n} views on the way back {len(done.taken.missing)} gave no frame."))
 
@@ -210,6 +222,23 @@ class Acquisition:
             raise InstrumentError(
                 f"{shutter.name}: it is {found}, {kind.name.lower()}s need it {wanted}. Check its interlock. "
                 "What was taken before is in the file."
+            )
+
+    def _remembered_places(self, kind: FrameKind) -> dict[str, Callable[[], str]]:
+        """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
+        devices = () if kind is FrameKind.DARK else (self._devices.sample, self._devices.filter)
+        every = (*devices, self._devices.monochromator) if devices else ()
+        return {device.name: device.remember_place() for device in every if isinstance(device, Rechecked)}
+
+    def _require_in_place(self, looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range) -> None:
+        """InstrumentError if a device that was moved and then believed is no longer where it stood before a block."""
+        moved = {name: said for name, look in looks.items() if (said := look())}
+        if moved and rows and not self._stop.aborting:
+            raise InstrumentError(
+                f"{'; '.join(f'{name}: {said}' for name, said in moved.items())}. It was moved while "
+                f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken: which of "
+                "them show it elsewhere is not known, so none should be used. Look who moved it, bring it back, and "
+                "take the scan again. What was taken before is good."
             )
 
     def _warm_up(self) -> None:
@@ -323,6 +352,19 @@ def _in_words(error: Exception) -> str:
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 
 
+def _astray(block: Block, taken: Taken) -> str:
+    """A sentence on frames exposed while the stage was not at its angle, and where it was."""
+    where = [
+        f"view {trigger} at {math.degrees(float(block.angles[trigger])):.4g}°: {math.degrees(places[-1][1]):.4f}°"
+        for trigger, places in list(taken.astray.items())[:NAMED]
+    ]
+    more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
+    return (
+        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of {len(taken.astray)} "
+        f"views ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+    )
+
+
 def _describe(done: TakenBlock) -> str:
     """Sentences on missing, extra and doubtful frames of a block."""
     block, taken, noun = done.block, done.taken, done.block.kind.name.lower()
@@ -337,6 +379,8 @@ def _describe(done: TakenBlock) -> str:
                 f" {taken.lost} were exposed but never delivered by the camera: `beamline doctor` looks at its link "
                 "and at the disk."
             )
+        if astray := sum(trigger in taken.astray for trigger in taken.missing):
+            text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
         if taken.ignored:
             text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
     if untriggered := taken.extra - taken.unconfirmed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -29,6 +30,13 @@ PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a 
 PATIENCE_PERIODS = 10  # so many trigger periods
 RAMP_TOLERANCE = 0.1  # share of the time that acceleration adds before the first pulse
 SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera counts as silent
+TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
+STANDS_WITHIN = 10.0  # s that a stage which somebody else moves may take to stand, before it is sent to a view again
+ASTRAY_ADVICE = (
+    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
+    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
+    "that a move is done"
+)
 NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 
@@ -44,6 +52,7 @@ class Taken:
         extra: frames that no trigger exposed.
         unconfirmed: of the extra ones, those exposed while the stage braked.
         shift, off: the largest of the passes, see `Ledger`.
+        astray: by trigger, of the frames exposed while the stage was not at its angle, the row and where it was, rad.
     """
 
     frames: int = 0
@@ -55,6 +64,7 @@ class Taken:
     unconfirmed: int = 0
     shift: int = 0
     off: float = 0.0
+    astray: dict[int, list[tuple[int, float]]] = field(default_factory=dict)
 
     def miss(self, triggers: Iterable[int]) -> None:
         """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
@@ -167,14 +177,21 @@ class Exposures:
         accepted = self._camera.configure(
             CameraSettings(block.exposure, source, self._settings.roi, self._settings.binning, self._settings.readout)
         )
-        frames = self._fly(block, taken) if block.trains else self._one_by_one(block, taken)
-        for row, (frame, trigger, angle) in enumerate(frames, first_row):
+        if block.trains:
+            frames = ((frame, trigger, angle, True) for frame, trigger, angle in self._fly(block, taken))
+        else:
+            frames = self._one_by_one(block, taken)
+        for row, (frame, trigger, angle, in_place) in enumerate(frames, first_row):
             taken.frames += 1
             kind, replaces = block.kind, -1
             if trigger == EXTRA:
                 kind = FrameKind.INVALID
+            elif not in_place:
+                kind = FrameKind.INVALID
+                taken.astray.setdefault(trigger, []).append((row, angle))
             else:
-                replaces, _ = taken.rows.get(trigger, (-1, 0.0))
+                before = taken.astray.get(trigger, [(-1, 0.0)])[-1]
+                replaces, _ = taken.rows.get(trigger, before)
                 taken.rows[trigger] = row, frame.time
             yield Frame(
                 frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces
@@ -308,22 +325,23 @@ class Exposures:
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
             flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
 
-    def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats."""
+    def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float, bool]]:
+        """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each
+        frame its trigger, where the stage was, and whether that was its angle."""
         self._camera.arm(block.n)
         period = max(block.period, self._camera.timing.min_period)
         patience = PATIENCE + block.exposure + self._camera.timing.readout
         position = self._stage.position()
         triggered, silent = -math.inf, 0
-        owed, i = self._stop.stopping, -1
+        owed, i, tried = self._stop.stopping, -1, Counter[int]()
         while (after := self._after_pause(i + 1, block, taken)) < block.n:
-            if after <= i:
+            if after <= i or tried[after]:
                 self._arm_anew(block.n - after)
-            i, angle = after, block.angles[after]
+            i, angle = after, float(block.angles[after])
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
-                if not self.go(float(angle)):
+                if not self.go(angle):
                     break
                 self._clock.sleep(self._settle)
                 position = self._stage.position()
@@ -332,8 +350,20 @@ class Exposures:
             triggered = self._clock.now()  # after the call: the time of the exposure within it is not known
             frame = self._next_frame(patience, until_stop=False)
             if frame is not None:
-                silent = 0
-                yield frame, i, position
+                silent, wrong = 0, ""
+                if math.isfinite(angle):
+                    position, wrong = self._looked_again(angle, position)
+                yield frame, i, position, not wrong
+                if wrong:
+                    tried[i] += 1
+                    if len(taken.astray) == tried[i] == 1:
+                        self._sink(Warned(f"View {i}: {wrong}"))
+                    if tried[i] == TRIES:
+                        taken.miss([i])
+                        tried[i] = 0
+                    else:
+                        i -= 1
+                    self._until_nobody_moves_it()
                 continue
             taken.miss([i])
             silent += 1
@@ -344,6 +374,25 @@ class Exposures:
                 )
             self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()
+
+    def _looked_again(self, angle: float, before: float) -> tuple[float, str]:
+        """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
+        anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
+        moving, after = self._stage.moving(), self._stage.position()
+        wanted, most = self._stage.to_counts(angle), self._stage.limits.tolerance
+        if not moving and all(abs(self._stage.to_counts(place) - wanted) <= most for place in (before, after)):
+            return (before + after) / 2, ""
+        return after, (
+            f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
+            f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
+            f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
+        )
+
+    def _until_nobody_moves_it(self) -> None:
+        deadline = self._clock.now() + STANDS_WITHIN
+        while self._stage.moving() and self._clock.now() < deadline:
+            self._stop.refuse_abort()
+            self._clock.sleep(POLL)
 
     def _arm_anew(self, n: int) -> None:
         self._camera.disarm()

@@ -29,6 +29,7 @@ from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import duration_text, work_out
 from beamline.scan.live_process import live_need
+from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from recon.base.choices import AUTO
@@ -126,13 +127,15 @@ def dry_run(
     if len(each) > 1:  # a scene is read at both ends of the range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
-    free = shutil.disk_usage(disk_of(runs or Path(settings.storage.folder))).free
+    there = disk_of(runs or Path(settings.storage.folder))
+    free = shutil.disk_usage(there).free
     plans = [remaining(plan_of(one)) for one in each]
     worked = [
         DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
         for one, plan in zip(each, plans, strict=True)
     ]
-    return worked[0] if settings.scan.energies is None else _of_energies(worked)
+    found = worked[0] if settings.scan.energies is None else _of_energies(worked)
+    return replace(found, timeline=_lockable(found.timeline, there))
 
 
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
@@ -163,6 +166,12 @@ def _worked(
     if not config.recon.live or method == AUTO or not streams(method):
         return worked
     return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, worked.views.n, free_memory())))
+
+
+def _lockable(worked: Timeline, folder: Path) -> Timeline:
+    """With a violation where files in the folder cannot be locked."""
+    said = no_locks(folder)
+    return replace(worked, violations=(*worked.violations, said)) if said else worked
 
 
 def refuse_violations(worked: Timeline) -> None:
@@ -219,6 +228,7 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, shutil.disk_usage(disk_of(runs)).free
     timeline = _worked(config, plan, stage.limits, stage.to_counts, timing, free)
+    timeline = _lockable(timeline, disk_of(runs))
     refuse_violations(timeline)
     info = _info(config, instrument, plan, timeline)
     monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))

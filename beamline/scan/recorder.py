@@ -109,6 +109,7 @@ class Recorder:
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
+        self._invalid: set[int] = set()  # rows that never were anything else
         self.retaken, self._retaking = 0, False
         self.references = ReferenceLog()
         self._failure: Exception | None = None
@@ -296,7 +297,10 @@ class Recorder:
         self._writer.append(frame, stored, flags)
         self.references.add(frame, seen)
         self.n_frames += 1
-        if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
+        beside = frame.replaces >= 0 and frame.replaces not in self._invalid and not self._retaking
+        if frame.kind is FrameKind.INVALID:
+            self._invalid.add(frame.index)
+        if frame.kind is FrameKind.INVALID or beside:
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
         self._report(frame, flags)
         if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:

@@ -8,7 +8,7 @@ file joins them all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -223,6 +223,27 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
             raise ConfigError(
                 f"{run} was taken with another {device}: {_words(before)}; now there is {_words(now)}. {_UNTOUCHED}"
             )
+
+
+def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
+    """A sentence on each device that is not the one which the newest run in this folder found at the same port."""
+    found: list[str] = []
+    with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
+        files = sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)
+        for path in files[-1:]:
+            with hdf5.open_hdf5(path) as stored:
+                devices = stored["/entry/instrument/devices"]
+                for device, said in ready.info.devices.items():
+                    group = hdf5.resolve(devices, device.replace("/", "_")) or {}
+                    earlier = {key: hdf5.text(group[key][()]) for key in group}
+                    before, now = _identity(earlier), _identity(said)
+                    if "port" in said and earlier.get("port") == said["port"] and before != now:
+                        found.append(
+                            f"{device}: at {said['port']} there is {_words(now)}; in {path.parent.name}, the run "
+                            f"before, it was {_words(before)}. If cables or ports were swapped, stop the scan. "
+                            "devices.stage.serial refuses another device, where its controller tells a serial number."
+                        )
+    return found
 
 
 def _identity(said: Mapping[str, Any]) -> dict[str, str]:

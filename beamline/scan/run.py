@@ -43,7 +43,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_sho
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
-from beamline.scan.resume import ResumableRun
+from beamline.scan.resume import ResumableRun, other_devices
 from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, Supervision
@@ -53,6 +53,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
+from drivers.stages.shared import FOUND
 
 SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
 
@@ -148,6 +149,7 @@ def run_scan(
         instrument.watch_moves(stop.refuse_abort)
         ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
+        others = [] if series else other_devices(place, ready)
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
             try:
@@ -159,6 +161,11 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             sink = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
+            for device, said in ready.info.devices.items():
+                if found := said.get(FOUND):
+                    sink(Warned(f"{device}: before it was opened: {found}."))
+            for sentence in others:
+                sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan

@@ -35,6 +35,7 @@ from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.base.clock import Clock, SystemClock
 from drivers.epics.devices import PvShutter
+from drivers.stages.shared import FOUND
 
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
 BETWEEN = 0.5  # s between attempts
@@ -149,6 +150,8 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
 
     def disarm() -> None:
         with closing(stage.connect(clock)) as connected:
+            if found := connected.describe().get(FOUND):
+                say(f"{connected.name}: {found}.")
             connected.disarm()
             if apart is None:
                 shutter_of(config, connected, clock, say).close()

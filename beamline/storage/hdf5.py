@@ -25,7 +25,7 @@ from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import superblock
-from beamline.storage.writer_lock import QUIET, held
+from beamline.storage.writer_lock import QUIET, LockFailure, held, held_sentence, lock_failure, opened_whole
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -69,7 +69,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
     if (changes := pending(path)) is not None:
         return h5py.File(Overlay(path, changes.ranges), "r")
-    problems = []
+    problems, is_held = [], False
     head = superblock(path)
     if grows_here(path) or (head is not None and head.grows and _died(path)):
         return _apart(path, follow)
@@ -82,11 +82,13 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         if swmr and (missing or not (follow or being_written)):
             continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
         try:
-            file = h5py.File(path, "r", swmr=swmr, locking=locking)
+            if swmr:
+                file = h5py.File(path, "r", swmr=swmr, locking=locking)
+            else:
+                file = opened_whole(path, unlocked=not being_written)
         except (OSError, ValueError) as error:
             problems.append(str(error))
-            if _without_locks(str(error)):
-                tries.append((swmr, False))  # nobody can lock it there, so that no lock says that it is written
+            is_held = is_held or lock_failure(error) is LockFailure.HELD
             continue
         try:
             with readable(path):
@@ -107,23 +109,9 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
             "writer died, `beamline recover` clears the mark; nothing was read."
         )
-    if (locked := next((problem for problem in problems if _LOCK.search(problem)), None)) is not None:
-        raise DataError(
-            f"{path} is locked: another program has it open to write it ({reason(OSError(locked))}). Close it there, "
-            "and try again. Where no program writes it, as after a crash on a network disk, read a copy of it, or "
-            "set HDF5_USE_FILE_LOCKING=FALSE. Nothing was read."
-        )
+    if is_held:
+        raise DataError(held_sentence(path))
     raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
-
-
-_LOCK = re.compile(r"unable to lock file(?:, errno = (\d+))?")
-
-
-def _without_locks(problem: str) -> bool:
-    """Whether HDF5 could not lock a file because its file system has no locks, as some network disks."""
-    found = _LOCK.search(problem)
-    no_locks = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
-    return found is not None and found[1] is not None and int(found[1]) in no_locks
 
 
 def grows_here(path: Path) -> bool:

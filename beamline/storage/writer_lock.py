@@ -1,14 +1,23 @@
-"""The lock of a program on the file that it writes, so that a long silence does not count as its death.
+"""Locks on files: ours on a file that is written, and HDF5's, where they fail.
 
-The system gives the lock back when the program ends, however it ends. HDF5 has none while a file can be followed.
+Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
+however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read
+whole. On a file system without locks (many NFS mounts) that fails.
 """
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import sys
+import tempfile
 import weakref
+from contextlib import suppress
+from enum import Enum
 from pathlib import Path
+
+import h5py
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 
@@ -27,6 +36,75 @@ else:
     def _lock(file: int, *, exclusive: bool) -> None:
         # Shared by the writer, because HDF5 takes a shared lock to open a file for reading.
         fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+
+
+SWITCH = "HDF5_USE_FILE_LOCKING"
+WITHOUT = f"{SWITCH}=FALSE"
+_NONE = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS}
+_OFF = {"FALSE", "0", "BEST_EFFORT"}
+
+
+class LockFailure(Enum):
+    """Why HDF5 got no lock."""
+
+    NO_LOCKS = "no locks"
+    HELD = "held"
+
+
+def lock_failure(error: BaseException) -> LockFailure | None:
+    """Whether an error of h5py says that a file could not be locked, and why; None: it is another error."""
+    said = re.search(r"unable to lock file, errno = (\d+)", str(error))
+    if said is None:
+        return None
+    return LockFailure.NO_LOCKS if int(said[1]) in _NONE else LockFailure.HELD
+
+
+def no_locks(folder: Path) -> str:
+    """A sentence if files in a folder cannot be locked, so that HDF5 would create none there; "" if they can, if HDF5
+    is told to do without, or if it cannot be found out."""
+    if os.environ.get(SWITCH, "").upper() in _OFF:
+        return ""
+    with suppress(OSError), tempfile.TemporaryFile(dir=folder, prefix=".beamline-lock-") as file:
+        try:
+            _lock(file.fileno(), exclusive=True)
+        except OSError as error:
+            if error.errno in _NONE:
+                return no_locks_sentence(folder, error.errno)
+    return ""
+
+
+def no_locks_sentence(place: Path, number: int | None = None) -> str:
+    """The cause, and the way."""
+    told = "" if number is None else f" (errno {number})"
+    return (
+        f"the file system of {place} has no file locks{told}, as NFS is often mounted, and HDF5 creates no file there; "
+        f"choose a storage.folder on a local disk, have it mounted with locks, or set {WITHOUT} in the environment"
+    )
+
+
+def held_sentence(path: Path) -> str:
+    return (
+        f"{path} is held by another program, which has it open to write (HDF5 got no lock on it). Close it there, or "
+        f"wait until that program has ended. With {WITHOUT} in the environment it is read as it is, perhaps half "
+        "written. Nothing was changed."
+    )
+
+
+def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
+    """A file that no program is writing, open to be read; without a lock where its file system has none.
+
+    Args:
+        unlocked: may be opened without a lock.
+
+    Raises:
+        OSError, ValueError: as h5py.File.
+    """
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if not unlocked or lock_failure(error) is not LockFailure.NO_LOCKS:
+            raise
+        return h5py.File(path, "r", locking=False)
 
 
 class WriterLock:

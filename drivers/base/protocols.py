@@ -23,6 +23,7 @@ class StageLimits:
         run_up: intervals of a train before its first pulse within which the stage cannot be armed.
         pulse_spacing: s that the pulses of a train must be apart at `max_speed`.
         interval_unit: counts; intervals of trains must be multiples of it (2 if each fire toggles the output).
+        tolerance: counts from its target within which the stage has arrived, and may stand while a frame is exposed.
     """
 
     counts_per_turn: int
@@ -34,6 +35,7 @@ class StageLimits:
     run_up: int = 0
     pulse_spacing: float = 0.0
     interval_unit: int = 1
+    tolerance: int = 10
 
 
 @dataclass(frozen=True)
@@ -254,6 +256,15 @@ class Watchable(Protocol):
 
     def watch(self, check: Callable[[], None]) -> None:
         """From now on `check` is called again and again while it moves; its exception ends the wait."""
+
+
+@runtime_checkable
+class Rechecked(Protocol):
+    """A device that is moved and then believed, and that can be asked whether it still stands where it did."""
+
+    def remember_place(self) -> Callable[[], str]:
+        """Note where it stands. The function returned says, whenever it is called, where it stands instead; "" if it is
+        still there. Both raise DeviceError."""
 
 
 @dataclass(frozen=True)

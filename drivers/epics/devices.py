@@ -149,6 +149,16 @@ class PvFilter:
                 advice="Look where it is, and whether this computer may write to it",
             )
 
+    def remember_place(self) -> Callable[[], str]:
+        """See `drivers.base.protocols.Rechecked`."""
+        before = self._said()
+
+        def moved() -> str:
+            now = self._said()
+            return "" if now.value == before.value else f"{self._status.name} was {before}, and is {now}"
+
+        return moved
+
     def _said(self) -> PvValue:
         return _valid(self._status, self.name)
 
@@ -236,6 +246,17 @@ class PvMonochromator:
         """Stop it where it can be stopped. Raises DeviceError."""
         if self._stopper is not None:
             self._stopper.write("", 1)
+
+    def remember_place(self) -> Callable[[], str]:
+        """See `drivers.base.protocols.Rechecked`. It may be off for less than `settle`, as after a move."""
+        before = self.energy()
+
+        def moved() -> str:
+            if _waited(lambda: self._is_at(before), self._pvs.settle, self._clock, self._check):
+                return ""
+            return f"it stood at {before:.7g} keV, and is at {self.energy():.7g} keV"
+
+        return moved
 
     def _is_at(self, energy: float) -> bool:
         return abs(self.energy() - energy) <= self._pvs.tolerance

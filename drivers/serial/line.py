@@ -23,6 +23,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 from drivers.serial.ports import open_port
 
+NEVER = r"(?!)"  # A form that no line has
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
 
@@ -44,6 +45,7 @@ class SerialLine:
         timeout: s for a whole reply, more than 0.
         unsolicited: regular expression of lines that the device may send without a request; they are skipped and
             recorded.
+        identified: each reply has the number of its request, so that a second one comes from another device.
         check: returns the fault of a received line, "" if it is good; for checksums.
         transcript: log file to which every byte sent and received is appended with its time; None: no file.
 
@@ -63,12 +65,15 @@ class SerialLine:
         baudrate: int,
         unsolicited: str = r"(?!)",
         framing: Framing = CRLF,
+        identified: bool = False,
         check: Callable[[str], str] = lambda line: "",
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
         self._asking, self._writing = threading.RLock(), threading.Lock()
         self._framing, self._in_step, self._closed = framing, True, False
+        self._identified = identified
+        self._answered = "", NEVER  # the last request that was answered, and the form of its reply
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
                 device,
@@ -129,12 +134,16 @@ class SerialLine:
                 if not self._in_step:
                     self._resynchronise(request, state)
                 self._in_step = False
-                self._reader.discard_lines()
+                for line in self._reader.discard_lines():
+                    self._refuse_second_reply(line, state)
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
             if isinstance(text, str) and (match := re.fullmatch(reply, text)) is not None:
                 self._in_step = True
+                self._answered = (request, reply) if self._identified else self._answered
                 return match
+            if isinstance(text, str):
+                self._refuse_second_reply(text, state)
             kind = DeviceTimeout if text is None else DeviceError
             if text is None:
                 problem, found = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
@@ -182,6 +191,20 @@ class SerialLine:
         self._wait_for_quiet(request, state)
         self._in_step = True
         self._transcript.add_line("!", "in step again")
+
+    def _refuse_second_reply(self, line: str, state: str) -> None:
+        """DeviceError if a line is another reply to the last request that was answered."""
+        request, form = self._answered
+        if re.fullmatch(form, line):
+            raise self._error(
+                DeviceError,
+                "two devices answered one request",
+                request=request,
+                reply=line,
+                expected="one reply",
+                advice="Two controllers on this line have the same address: give each its own, or unplug one",
+                state=f"{state}. Both did what was asked before",
+            )
 
     def _wait_for_quiet(self, request: str, state: str) -> None:
         if not self._reader.drain(self._clock.now() + max(self._timeout, 10 * QUIET)):

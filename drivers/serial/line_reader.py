@@ -176,8 +176,9 @@ class LineReader:
                 return False
         return True
 
-    def discard_lines(self) -> None:
-        """Discard the complete lines received so far: they cannot be the reply to a request not yet sent.
+    def discard_lines(self) -> list[str]:
+        """Discard the complete lines received so far, and return them: they cannot be the reply to a request not yet
+        sent.
 
         The rest stays: it may be the beginning of an unsolicited line.
         """
@@ -187,6 +188,7 @@ class LineReader:
         if end:
             self._transcript.add_line("!", f"discarded {readable(old)}")
             self._received = bytearray(rest)
+        return [readable(line) for line in old.split(self._framing.line_end)] if end else []
 
     def _read(self) -> bytes:
         """The bytes that have arrived (over TCP one of them), or the first to arrive; b"" if the line stays silent."""

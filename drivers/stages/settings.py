@@ -92,7 +92,13 @@ class StageFigures:
         return self.counts_per_turn / (2 * math.pi)
 
     def limits(
-        self, acceleration: float, pulse_spacing: float, *, run_up: int = 0, interval_unit: int = 1
+        self,
+        acceleration: float,
+        pulse_spacing: float,
+        *,
+        run_up: int = 0,
+        interval_unit: int = 1,
+        tolerance: int = 0,
     ) -> StageLimits:
         """The limits of a stage with these figures and a trigger output; arguments as in `StageLimits`.
 
@@ -111,6 +117,7 @@ class StageFigures:
             run_up,
             pulse_spacing,
             interval_unit,
+            tolerance,
         )
 
 

@@ -85,6 +85,28 @@ def longest_stop(limits: StageLimits) -> float:
     return limits.max_speed / limits.acceleration + STOP_MARGIN
 
 
+FOUND = "found_at_opening"
+"""Key of a description: what a controller said of the time before it was opened, which opening has cleared."""
+
+
+def found_at_opening(*sentences: str) -> dict[str, str]:
+    """The entry of a description; none if all sentences are empty."""
+    said = "; ".join(filter(None, sentences))
+    return {FOUND: said} if said else {}
+
+
+def refuse_another(name: str, wanted: str | None, serial: str) -> None:
+    """Refuse a device with another serial number than the configured one; None: any may answer."""
+    if wanted is not None and serial != wanted:
+        raise DeviceRefused(
+            name,
+            f"another device answers: its serial number is {serial or 'not told'}",
+            expected=f"{wanted}, as configured",
+            advice="Check whether cables or ports were swapped, or correct `serial` in the configuration",
+            state="Nothing has moved",
+        )
+
+
 def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
     """The refusal of what needs a standing stage."""
     return DeviceRefused(

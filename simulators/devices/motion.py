@@ -7,6 +7,7 @@ With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 
@@ -33,12 +34,17 @@ class MotionPhase:
 
 @dataclass(frozen=True)
 class TrapezoidMove:
-    """A move from `start` to `target` that began at `begin` (s, on any clock). Built by `between`."""
+    """A move from `start` to `target` that began at `begin` (s, on any clock). Built by `between`.
+
+    `beyond`: how far something that no controller reports as a move has turned it beyond, at a time: a hand on the
+    knob, a servo that hunts, a motor that goes on after "done". None: nothing has.
+    """
 
     begin: float
     start: float
     target: float
     phases: tuple[MotionPhase, ...]
+    beyond: Callable[[float], float] | None = None
 
     @classmethod
     def between(
@@ -86,6 +92,9 @@ class TrapezoidMove:
         return (self.target > self.start) - (self.target < self.start)
 
     def position(self, time: float) -> float:
+        return self._commanded(time) + (0.0 if self.beyond is None else self.beyond(time))
+
+    def _commanded(self, time: float) -> float:
         phase = self._phase(time)
         if phase is None:
             return self.start if time < self.begin else self.target

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 
 from drivers.base.clock import Clock
@@ -173,6 +173,10 @@ class PulseMotor:
         now, here = self._clock.now(), self.position()
         self.zero += count - here
         self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
+
+    def disturb(self, beyond: Callable[[float], float]) -> None:
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
+        self._replace(replace(self.move, beyond=beyond))
 
     def start(self, target: int, speed: float, acceleration: float) -> None:
         """Move from standing to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""

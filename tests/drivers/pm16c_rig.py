@@ -18,8 +18,8 @@ from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())
 COUNTS = 90_000
-QUERIES_TO_OPEN = 9
-"""VER? STS? STS? STS? SETCH? SETCH? TMGR? RTE? SETLS?: the faults below count queries from power-on."""
+QUERIES_TO_OPEN = 13
+"""VER? STS? STS? STS? ERRF? SETCH? RTE? SPDH? SPD? SETCH? TMGR? RTE? SETLS?: faults count queries from power-on."""
 
 
 class Rig:

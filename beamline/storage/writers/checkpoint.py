@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from beamline.core.files import whole_file
 from beamline.core.shipped import version
 from beamline.storage import hdf5
 from beamline.storage.structure import require_harmless
+from beamline.storage.writer_lock import opened_whole
 from beamline.storage.writers.recon_file import Value, value_of
 
 _FORMAT = "splatline checkpoint 1"
@@ -61,7 +61,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
     try:
-        with h5py.File(path, "r") as file:
+        with opened_whole(path) as file:
             require_harmless(file)
             said = file.attrs.get("format")
             if said != _FORMAT:

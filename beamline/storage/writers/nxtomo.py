@@ -24,7 +24,7 @@ from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of, place_of
-from beamline.storage.writer_lock import WriterLock
+from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
@@ -86,6 +86,11 @@ class NXtomoWriter:
                 f"{self.path} exists. A scan never overwrites a file: name a new one. Nothing was written."
             ) from error
         except OSError as error:
+            with suppress(OSError):  # made by HDF5, which then failed; one that was there is a FileExistsError
+                self.path.unlink()
+            if lock_failure(error) is LockFailure.NO_LOCKS:
+                why = no_locks_sentence(self.path.parent, error.errno)
+                raise DataError(f"{self.path} cannot be created: {why}. Nothing is left of it.") from error
             why = hdf5.reason(error)
             raise DataError(f"{self.path} cannot be created ({why}). Is its folder there and writable?") from error
         try:

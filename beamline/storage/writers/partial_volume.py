@@ -23,7 +23,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, refuse_existing, whole_file
 from beamline.storage import hdf5
 from beamline.storage.scratch import reserve
-from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.writer_lock import WriterLock, held, opened_whole
 from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, Value, rewrite_facts, value_of, write_record
 from recon.base.slabs import Slab
 
@@ -136,7 +136,7 @@ def open_partial(path: Path) -> PartialVolume:
     _put_back(path)
     _refuse_unusable(path)
     lock = WriterLock(path)
-    with hdf5.readable(path), h5py.File(path, "r") as file:
+    with hdf5.readable(path), opened_whole(path) as file:
         group = file[_SLABS]
         slabs = _slabs_in(group)
         made_from = {name: value_of(node) for name, node in group["made_from"].items()}
@@ -219,7 +219,7 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
     """
     _put_back(path)
     _refuse_unusable(path)
-    with hdf5.readable(path), h5py.File(path, "r") as file:
+    with hdf5.readable(path), opened_whole(path) as file:
         slabs, state = _slabs_in(file[_SLABS]), file[_PLACES["state"]][()]
     return slabs, [slab for slab, is_at in zip(slabs, state, strict=True) if is_at != _DONE]
 

@@ -20,6 +20,7 @@ from beamline.core.shipped import version
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
 from beamline.storage.structure import require_harmless
+from beamline.storage.writer_lock import opened_whole
 from recon.base.volume import Grid, Volume
 
 DEFINITION = "NXtomoproc"
@@ -233,7 +234,7 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
     """
     with ExitStack() as stack:
         try:
-            file = stack.enter_context(h5py.File(path, "r"))
+            file = stack.enter_context(opened_whole(path))
             require_harmless(file)
             n = volumes_in_time(file)
             if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):

@@ -45,5 +45,11 @@ class EpicsSettings:
         """See `StageSettings`."""
         figures = self.figures
         return StageLimits(
-            figures.counts_per_turn, figures.max_speed, figures.acceleration, figures.low, figures.high, False
+            figures.counts_per_turn,
+            figures.max_speed,
+            figures.acceleration,
+            figures.low,
+            figures.high,
+            False,
+            tolerance=self.tolerance,
         )

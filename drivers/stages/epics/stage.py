@@ -1,7 +1,8 @@
 """EPICS motor record as a stage, over PVAccess or Channel Access (Mooney and Sluiter, motor record reference, R7).
 
-The record has no trigger output: a configuration with it takes step scans. A value written to VAL sets DMOV to 0 before
-any later read. A move is over when DMOV is 1; RBV then says whether it arrived.
+The record has no trigger output: a configuration with it takes step scans. A move is over when DMOV is 1; RBV then says
+whether it arrived. A record should set DMOV to 0 before the write of VAL is answered. Some do so later, and some say 1
+while the motor still turns: off its target, a motor stands when its place has not changed for `STILL`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
 from drivers.stages.epics.settings import EpicsSettings, Search
-from drivers.stages.shared import LineStage, Stops, until_standing, while_it_moves
+from drivers.stages.kept import FoundSettings, SettingsStore
+from drivers.stages.shared import LineStage, Stops, found_at_opening, until_standing, while_it_moves
 from drivers.stages.travel import Travel
 
 HOMED = 0x4000 | 0x0080
@@ -29,6 +31,8 @@ FAULTS = {  # bit of MSTA: what it says, what to do
     0x0004: ("it is at its upper limit switch", "Move away from the switch by hand or in the record's own screen"),
     0x2000: ("it is at its lower limit switch", "Move away from the switch by hand or in the record's own screen"),
 }
+STILL = 1.0  # s without a change of RBV, after which a motor that says it is done, but is not at its target, stands
+CREEP = 10.0  # s that such a motor may still take to stand, at least
 GO, USE = "Go", "Use"
 """Labels of SPMG and SET with which a value written to VAL moves the motor."""
 
@@ -67,7 +71,9 @@ class EpicsStage(LineStage):
         self._searching, self._stops_before = False, 0
         self._last = ""
         self._channel = open_channel(url, name, settings.timeout)
-        self._kept: dict[str, float] = {}
+        self._begun = self._looked = self._same_since = -math.inf  # s: the last move, the last look, the same place
+        self._place = math.nan
+        self._found = FoundSettings()
         try:
             self._model = self._checked()
         except BaseException:
@@ -102,7 +108,7 @@ class EpicsStage(LineStage):
                     advice="Compare HLM and LLM of the record with low_deg and high_deg",
                     state="Nothing has moved",
                 )
-        self._target = target
+        self._target, self._begun = target, self._clock.now()
 
     def start_home(self) -> None:
         """Soft limits do not hold on the way."""
@@ -122,21 +128,35 @@ class EpicsStage(LineStage):
         self._target, self._searching = None, True
 
     def moving(self) -> bool:
-        return not self._status().done
+        status, now = self._status(), self._clock.now()
+        recent, same = now - self._looked <= STILL, status.place == self._place
+        if not (recent and same):
+            self._same_since = now
+        self._looked, self._place = now, status.place
+        if not status.done:
+            return True
+        if self._target is None or self._is_at_target(status) or self._was_stopped:
+            return False
+        return now - self._begun < STILL or (recent and not same)
 
     def wait(self, timeout: float) -> float:
         until_standing(self._clock, self.moving, bool, timeout)
-        status = self._status()  # read anew: RBV may have been read before DMOV became 1
-        counts, target = self._counts_of(status), self._target
+        status, target = self._status(), self._target  # read anew: RBV may have been read before DMOV became 1
+        arrived = target is None or self._is_at_target(status)
+        if status.done and not (arrived or self._was_stopped):  # it says so, and is not there: look whether it stands
+            longest = max(timeout, CREEP)
+            until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, longest)
+            status = self._status()
+            arrived = self._is_at_target(status)
+        counts = self._counts_of(status)
         aim = "its reference" if self._searching else "" if target is None else self._travel.degrees(target)
-        if not status.done:
-            raise self._travel.still_moving(timeout, counts, aim, self._last)
-        stopped = self._stops.count != self._stops_before
+        if not status.done or not (arrived or self._was_stopped or self._seen_to_stand):
+            raise self._travel.still_moving(timeout, counts, aim, self._last, self._hindrance())
         if self._searching:
-            arrived = not stopped and bool(status.bits & HOMED)
-        else:
-            arrived = target is None or abs(counts - target) <= self._settings.tolerance
+            arrived = not self._was_stopped and bool(status.bits & HOMED)
         fault, advice = status.fault
+        if not arrived and not fault:
+            fault = self._hindrance()
         if not arrived or (aim and fault):
             self._failed(f"it stopped short of {aim}" if not arrived else f"a fault at {aim}", counts, fault, advice)
         self._searching = False
@@ -167,15 +187,47 @@ class EpicsStage(LineStage):
             "model": self._model,
             "port": self._url,
             "trigger_output": "none",
+            **found_at_opening(self._found.said),
             **self._travel.described(),
         }
 
     def close(self) -> None:
         with contextlib.suppress(DeviceError):  # a record that is gone, or closed already
-            for suffix, value in self._kept.items():
-                self._channel.write(suffix, value)
-        self._kept = {}
+            self._found.restore(lambda suffix, value: self._channel.write(suffix, float(value)))
         self._channel.close()
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._found.keep_in(store)
+
+    @property
+    def _was_stopped(self) -> bool:
+        return self._stops.count != self._stops_before
+
+    @property
+    def _seen_to_stand(self) -> bool:
+        """Its place was the same in every look of the last `STILL`."""
+        return self._looked - self._same_since >= STILL
+
+    def _is_at_target(self, status: MotorStatus) -> bool:
+        return self._target is not None and abs(self._counts_of(status) - self._target) <= self._settings.tolerance
+
+    def _hindrance(self) -> str:
+        """Why a move did not arrive, by the record; "" if it says nothing, or has no such fields."""
+        words = []
+        with contextlib.suppress(DeviceError):
+            (mode,) = self._read(".SPMG")
+            if mode.label != GO:
+                words.append(f"SPMG is {mode}: somebody paused or stopped it in the record")
+        with contextlib.suppress(DeviceError):
+            (disabled,) = self._read(".DISP")
+            if disabled.value:
+                words.append("DISP is 1: the record takes no values")
+        with contextlib.suppress(DeviceError):
+            (wanted,) = self._read(".VAL")
+            counts = round(float(wanted.value) * self.limits.counts_per_turn / 360)
+            if self._target is not None and abs(counts - self._target) > self._settings.tolerance:
+                words.append(f"VAL is {wanted}: another client has sent it elsewhere, or it did not take the value")
+        return ", ".join(words)
 
     def _counts(self) -> int:
         return self._counts_of(self._status())
@@ -220,13 +272,14 @@ class EpicsStage(LineStage):
                 )
 
     def _failed(self, problem: str, counts: int, fault: str, advice: str) -> NoReturn:
+        verb = "stands" if self._seen_to_stand else "is"
         raise DeviceError(
             self.name,
             problem,
             request=self._last,
             expected="to stand there without a fault",
             advice=advice or "Find who or what stopped it before moving on",
-            state=f"It stands at {self._travel.degrees(counts)}, {counts} counts: {fault or 'no reason given'}",
+            state=f"It {verb} at {self._travel.degrees(counts)}, {counts} counts: {fault or 'no reason given'}",
         )
 
     def _checked(self) -> str:
@@ -253,5 +306,5 @@ class EpicsStage(LineStage):
             self._travel.refuse_narrower(low_counts, high_counts, "widen LLM and HLM of the record")
         self._standing("opening")
         self._slowest = max(float(slowest.value), 0.0)
-        self._kept = {".VELO": float(velocity.value), ".ACCL": float(seconds.value)}
+        self._found.values = {".VELO": velocity.text, ".ACCL": seconds.text}
         return f"EPICS motor record {self._channel.name} ({about.value})"

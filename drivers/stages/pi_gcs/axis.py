@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from drivers.base.errors import DeviceRefused
+from drivers.stages.kept import FoundSettings
 from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
 from drivers.stages.pi_gcs.settings import PiGcsSettings
@@ -42,6 +43,10 @@ class PiGcsAxis:
         self.last_move = ""
         """The command of the last move or search, for errors."""
         self._identity = ""
+        self.error_at_opening = 0
+        """The code that the error register had, which opening cleared."""
+        self.found = FoundSettings()
+        """VEL, and the accelerations by the commands that set them, in degrees."""
 
     def degrees(self, counts: Fraction | int) -> str:
         """The text for a place, distance or rate: its rounding is far below a count over any train."""
@@ -56,7 +61,7 @@ class PiGcsAxis:
         self._identity = self._line.ask("*IDN?", r".*Physik Instrumente.*", "the identity of a PI controller")[0]
         if self._line.ask("CSV?", r"(\d+)(?:\.\d+)?", "the version of the command language")[1] != "2":
             raise self._refused(f"{self._identity} does not talk GCS 2.0", "Use a controller with command syntax 2.0")
-        self._line.read_error()
+        self.error_at_opening = self._line.read_error()
         axes = [line.strip() for line in self._line.ask("SAI?", r"[\w\s-]+", "the names of its axes")[0].split("\n")]
         if self._axis not in axes:
             raise self._refused(f"it has no axis {self._axis!r}, but {', '.join(axes)}", "Correct the configured axis")
@@ -68,6 +73,7 @@ class PiGcsAxis:
             self._line.set(f"SVO {self._axis} 1")
             if not self._line.flag("SVO?"):
                 raise self._line.not_followed(f"SVO {self._axis} 1", "0", "1")
+        self.found.values["VEL"] = self._line.number("VEL?")
         self._take_accelerations(acceleration)
         self._line.fault = 0
         return self._identity
@@ -211,6 +217,9 @@ class PiGcsAxis:
     def _take_accelerations(self, rate: Fraction) -> None:
         """Set accelerations by ACC and DEC; a controller without these commands has parameters for both."""
         for command, parameter in (("ACC", ACCELERATION), ("DEC", DECELERATION)):
+            before = self._line.parameter(parameter)
+            if before is not None:
+                self.found.values[f"SPA {parameter}"] = before
             try:
                 self._take_rate(command, rate)
             except DeviceRefused:
@@ -230,8 +239,19 @@ class PiGcsAxis:
         if not _nearly(text, reply):
             raise self._line.not_followed(f"{command} {self._axis} {text}", reply, text)
 
+    def restore(self) -> None:
+        """Set what moves and opening have changed back, unless the axis moves: a move under way would follow."""
+        if self.found.values and not self.moving():
+            self.found.restore(lambda setting, value: self._line.set(_setting(setting, self._axis, value)))
+
     def _refused(self, problem: str, advice: str, request: str = "") -> DeviceRefused:
         return DeviceRefused(self._name, problem, request=request, advice=advice, state="Nothing has moved")
+
+
+def _setting(name: str, axis: str, value: str) -> str:
+    """The command that sets VEL or a parameter."""
+    command, _, parameter = name.partition(" ")
+    return f"{command} {axis} {f'{parameter} ' if parameter else ''}{value}"
 
 
 def _nearly(sent: str, reply: str) -> bool:

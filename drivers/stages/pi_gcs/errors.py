@@ -62,6 +62,8 @@ REFUSALS = {
 }
 """Code -> meaning and advice, for a refused command without other effects."""
 
+MOTION = frozenset({45, 49, 333, 504, 505, 1024, 1025})
+"""Events after which the axis may not be where it was sent: errors of the move in which they come."""
 EVENTS = {
     STOPPED: ("stopped by command", "Find who stopped it before moving on"),
     45: ("the reference move failed", "Check the reference switch, its cable and what is in the stage's way"),

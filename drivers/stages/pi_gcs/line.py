@@ -115,9 +115,10 @@ class GcsLine:
         try:
             return self.ask(request, rf"{re.escape(self._axis)} \w+ ?= ?{NUMBER}", f"{self._axis} {number}=number")[1]
         except DeviceTimeout:
+            before = self.fault
             if self.read_error() not in REFUSALS:
                 raise
-            self.fault = 0
+            self.fault = before
             return None
 
     def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:

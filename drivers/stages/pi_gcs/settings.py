@@ -42,6 +42,7 @@ class PiGcsSettings:
     figures: StageFigures
     wiring: Wiring = field(default=Wiring())
     axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
+    serial: str | None = key(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
     trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
     reference: Reference = key(Reference.SWITCH, "What the search for the reference goes to.")
     first_pulse: PiFirstPulse = key(
@@ -73,4 +74,5 @@ class PiGcsSettings:
         if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
         run_up = 1 if self.first_pulse is PiFirstPulse.STEP_AFTER else 0
-        return figures.limits(figures.acceleration, 2 * self.firmware_pulse, run_up=run_up)
+        spacing = 2 * self.firmware_pulse
+        return figures.limits(figures.acceleration, spacing, run_up=run_up, tolerance=self.tolerance)

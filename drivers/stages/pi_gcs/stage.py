@@ -8,23 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
+from drivers.stages.kept import SettingsStore
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
-from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
+from drivers.stages.pi_gcs.errors import EVENTS, MOTION, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
 from drivers.stages.pi_gcs.train import is_spent_by, window_of
-from drivers.stages.shared import POLL, LineStage, Stops, until_standing
+from drivers.stages.shared import POLL, LineStage, Stops, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
 
 
 class PiGcsStage(LineStage):
-    """Opening switches the servo on and the trigger line off. Closing leaves both, and a move under way, as they are.
+    """Opening switches the servo on and the trigger line off. Closing leaves both as they are. It restores velocity and
+    accelerations, unless a move is under way, which it leaves.
 
     `abort` stops all axes of the controller. A move that would emit a train a second time, or turn back inside it, ends
     the train.
@@ -45,10 +47,14 @@ class PiGcsStage(LineStage):
         self._stops = Stops(name, self._send_stop)
         self._stops_before = 0
         self._train: TriggerTrain | None = None
+        self._told = 0  # the code of the error register that an error has told
+        self._closed = False
         self._line = GcsLine(url, settings.axis, settings.wiring, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
         try:
             self._identity = self._axis.open(Fraction(settings.figures.acceleration) * self._per_radian)
+            self._serial = self._identity.split(",")[2].strip() if self._identity.count(",") >= 2 else ""
+            refuse_another(name, settings.serial, self._serial)
             self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
         except BaseException:
             self.close()
@@ -68,10 +74,12 @@ class PiGcsStage(LineStage):
             raise self._travel.no_such_speed(speed, f"{SLOWEST:g} deg/s or more")
         with self._begin("the move"):
             self._axis.standing("a move")
+            self._refuse_untold()
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
                 self.disarm()
             self._target, self._homing = None, False  # clear the earlier move: it is not the reason if this one fails
             self._axis.start(target, Fraction(speed) * self._per_radian)
+            self._told = 0
             self._target = target
 
     def start_home(self) -> None:
@@ -102,6 +110,8 @@ class PiGcsStage(LineStage):
         elif target is not None and (self._away(status.counts) or not status.servo):
             wanted = f"{self._travel.degrees(target)}, {target} counts"
             raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
+        elif target is not None and self._line.fault in MOTION:
+            raise self._stopped_short(f"a fault at {self._travel.degrees(target)}", status, "no error of the move")
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
@@ -131,6 +141,8 @@ class PiGcsStage(LineStage):
             "trigger_polarity": "active high" if self._settings.wiring.active_high else "active low",
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
+            **({"serial": self._serial} if self._serial else {}),
+            **found_at_opening(meaning(self._axis.error_at_opening), self._axis.found.said),
             **self._travel.described(),
         }
 
@@ -140,7 +152,29 @@ class PiGcsStage(LineStage):
         return GcsOutput(self._line, number, f"{self.name} output {number}")
 
     def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with suppress(DeviceError):  # a dead line is closed, too
+                self._axis.restore()
         self._line.close()
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._axis.found.keep_in(store)
+
+    def _refuse_untold(self) -> None:
+        """DeviceError, once, for what happened to the standing axis since its last move."""
+        code = self._line.fault
+        if code not in MOTION or code == self._told:
+            return
+        self._told = code
+        raise DeviceError(
+            self.name,
+            f"since its last move something happened to it: {meaning(code)}",
+            reply=str(code),
+            expected="an axis that stood still",
+            advice=f"{advice(code)}. What was measured since then may have been at another angle",
+            state=f"Nothing has moved by this; it stands at {self._travel.degrees(self._axis.counts())}",
+        )
 
     @contextmanager
     def _begin(self, purpose: str) -> Iterator[None]:
@@ -177,6 +211,7 @@ class PiGcsStage(LineStage):
 
     def _stopped_short(self, problem: str, status: PiAxisStatus, expected: str) -> DeviceError:
         code, why = self._line.fault, self._fault(status) or "no reason given"
+        self._told = code
         return DeviceError(
             self.name,
             f"{problem} ({why})",

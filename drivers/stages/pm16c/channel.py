@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.stages.kept import FoundSettings
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
 from drivers.stages.settings import Wiring
@@ -19,6 +20,8 @@ from drivers.stages.shared import while_it_moves
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
+ERRORS = {0x2: "a move was refused because its pulse chip was busy", 0x4: "a move to a wrong place was refused"}
+"""Error flags that tell of the motor; that of an unknown command is set by the empty line of every opening, too."""
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
 
@@ -50,6 +53,10 @@ class PM16CChannel:
         self._name, self._digit = name, f"{channel:X}"
         self.last_move = ""
         """The command of the last move or search, for errors."""
+        self.error_at_opening = ""
+        """What the controller's error flags said, which opening cleared."""
+        self.found = FoundSettings()
+        """What opening and moves change: position controllers, acceleration code, high speed, selected speed."""
         self._restore_local = False
         self._line = PM16CLine(url, wiring, clock, name)
 
@@ -64,8 +71,11 @@ class PM16CChannel:
             self._restore_local = True
             self._line.until(self.status, lambda status: status.remote)
         self.standing("opening")
+        flags = int(self._line.ask("ERRF?", r"[0-9A-F]{2}", "error flags")[0], 16)
+        self.error_at_opening = " and ".join(text for bit, text in ERRORS.items() if flags & bit)
         self._line.send("ERRC")
-        if not self._channels().startswith(c):
+        self._found_settings(channels := self._channels())
+        if not channels.startswith(c):
             self._line.send(command := f"SETCH{c}---")
             channels = self._line.until(self._channels, lambda channels: channels.startswith(c))
             if not channels.startswith(c):
@@ -158,10 +168,26 @@ class PM16CChannel:
     def close(self) -> None:
         """Give the panel back if it was in LOCAL, and free the port even if the line is dead."""
         try:
+            self._restore()
             if self._restore_local:
                 self._line.send("LOC")
         finally:
             self._line.close()
+
+    def _found_settings(self, channels: str) -> None:
+        c = self._digit
+        rate = self._line.ask(f"RTE?{c}", r"\d+", "an acceleration code")[0]
+        speed = self._line.ask(f"SPDH?{c}", r"\d+", "pulses/s")[0]
+        selected = self._line.ask(f"SPD?{c}", "([HML])SPD", "the selected speed")[1]
+        values = {"RTE": f"{int(rate):03d}", "SPDH": str(int(speed)), "SPD": selected, "SETCH": channels}
+        self.found.values = values
+
+    def _restore(self) -> None:
+        """Set back what opening and moves have changed; not while a motor moves, which then refuses it."""
+        c, write = self._digit, self._line.send
+        if self.found.values and not (status := self.status()).moving and status.remote:
+            forms = {"RTE": f"RTE{c}{{}}", "SPDH": f"SPDH{c}{{}}", "SPD": f"SPD{{}}{c}", "SETCH": "SETCH{}"}
+            self.found.restore(lambda name, value: write(forms[name].format(value)))
 
     def _channels(self) -> str:
         """On position controllers A to D."""

@@ -12,15 +12,17 @@ import math
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, TriggerTrain
+from drivers.stages.kept import SettingsStore
 from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import MODES, points_of
-from drivers.stages.shared import LineStage, Stops, until_standing
+from drivers.stages.shared import LineStage, Stops, found_at_opening, until_standing
 from drivers.stages.travel import Travel
 
 
 class PM16CStage(LineStage):
-    """Closing it leaves a move under way to end by itself. Arming and disarming need a standing stage.
+    """Closing it restores speed, acceleration and position controllers as they were found; a move under way ends by
+    itself, and they stay then. Arming and disarming need a standing stage.
 
     Args:
         url: what pyserial opens; the controller's LAN port is "socket://host:7777".
@@ -120,6 +122,7 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
+            **found_at_opening(self._channel.error_at_opening, self._channel.found.said),
             **self._travel.described(),
         }
 
@@ -128,6 +131,9 @@ class PM16CStage(LineStage):
             self._closed = True
             with contextlib.suppress(DeviceError):  # a dead line is closed, too
                 self._channel.close()
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._channel.found.keep_in(store)
 
     def _send_stop(self, hard: bool) -> str:
         if (search := self._search) is not None:

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
 from drivers.serial.line import Probe
+from drivers.stages.kept import FoundSettings
 from drivers.stages.shared import while_it_moves
 from drivers.stages.zaber.packet import (
     REASONS,
+    SLIPPED,
     UNREFERENCED,
     Reply,
     damage,
@@ -31,8 +33,9 @@ REPEATS = 3  # How often a command is sent again if the device answers AGAIN
 PAUSE = 0.05  # s before that
 TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """Most digits of a position; a longer number is impossible for an axis and for a float."""
+CHECKSUM = "comm.checksum"
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
-"""Settings of the axis that survive a power cycle; the driver restores them at the end."""
+"""Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,9 @@ class ZaberAxisStatus:
         return UNREFERENCED.isdisjoint(self.flags)
 
     @property
-    def faulty(self) -> bool:
-        """Whether a fault stands, whatever the last move did."""
-        return any(flag.startswith("F") for flag in self.flags)
+    def grave(self) -> frozenset[str]:
+        """Flags of faults, and of a stage that slipped or was moved, whatever the last move did."""
+        return frozenset(flag for flag in self.flags if flag.startswith("F")) | (SLIPPED & set(self.flags))
 
 
 class ZaberAxis:
@@ -83,28 +86,30 @@ class ZaberAxis:
         self._commanded = False
         self.last_move = ""
         """The command of the last move or search, for errors."""
-        self._found: dict[str, str] = {}
-        self._checksums_found = "1"
+        self.found = FoundSettings()
+        self.flags_at_opening: tuple[str, ...] = ()
         self._line = wiring.line(
             url,
             name,
             clock,
             Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
             unsolicited=passed_over_form(STOP_ID),
+            identified=True,
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
         )
 
     def open(self) -> Identity:
         """Switch checksums on, identify the device, remember the settings that will change."""
         self._line.send("")  # an empty line ends an incomplete command in the device
-        if (found := self._get_if_known("comm.checksum")) is not None:
-            self._checksums_found = found
-            self.ask("set comm.checksum 1")
+        if (checksums := self._get_if_known(CHECKSUM)) is not None:
+            self.ask(f"set {CHECKSUM} 1")
             self._must_have_checksum = True
         number = self._get_if_known("device.id") or self.ask("get deviceid", WHOLE).data
         identity = Identity(number, self.ask("get system.serial", WHOLE).data, self.ask("get version", NUMBER).data)
-        self.standing("opening")
-        self._found = {setting: self.get(setting) for setting in KEPT}
+        self.flags_at_opening = self.standing("opening").flags
+        self.found.values = {setting: self.get(setting) for setting in KEPT}
+        if checksums is not None:
+            self.found.values[CHECKSUM] = checksums
         return identity
 
     def cycle(self) -> str | None:
@@ -159,13 +164,16 @@ class ZaberAxis:
     def close(self) -> None:
         """Restore the settings, and free the port even if the line is dead."""
         try:
-            for setting, value in self._found.items():
-                self.set(setting, value)
-            if self._checksums_found != "1":
-                self._must_have_checksum = False
-                self.ask(f"set comm.checksum {self._checksums_found}")
+            self.found.restore(self._restore)
         finally:
             self._line.close()
+
+    def _restore(self, setting: str, value: str) -> None:
+        if setting != CHECKSUM:
+            self.set(setting, value)
+        elif value != "1":
+            self._must_have_checksum = False
+            self.ask(f"set {CHECKSUM} {value}")
 
     def _begin(self, words: str) -> None:
         self._commanded, self.last_move = True, words

@@ -56,6 +56,10 @@ ENDINGS = {
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
 """Flags that can explain why a move ended early, beside those of faults."""
+SLIPPED = frozenset({"WL", "WS", "WM", "NC"})
+"""Flags after which the stage may not be where its counts say: beside faults, errors of the move in which they come."""
+LOST = frozenset({"FS", "FQ", "FI", "FA", "FE"})
+"""Flags of faults after which the same holds."""
 UNREFERENCED = frozenset({"WR", "WH"})  # Flags of an axis that does not know its reference
 REASONS = {
     "AGAIN": "it asks to repeat, again and again",

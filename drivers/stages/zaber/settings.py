@@ -28,6 +28,7 @@ class ZaberSettings:
     wiring: Wiring = field(default=Wiring())
     device: int = key(1, ge=1, le=99)
     axis: int = key(1, ge=1, le=9)
+    serial: str | None = key(None, "Its serial number (system.serial): another device is refused; null: any is taken.")
     output: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
     toggle: bool = key(
         False,

@@ -14,10 +14,11 @@ from dataclasses import replace
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.shared import LineStage, Stops, until_standing
+from drivers.stages.kept import SettingsStore
+from drivers.stages.shared import LineStage, Stops, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import ZaberAxis
-from drivers.stages.zaber.packet import meaning_of
+from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
+from drivers.stages.zaber.packet import LOST, SLIPPED, meaning_of
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
 
@@ -133,12 +134,15 @@ class ZaberStage(LineStage):
         self._travel = Travel(name, settings.limits())
         self._target: int | None = None
         self._homing = False
+        self._told = frozenset[str]()  # flags that an error, or the description, has told
         self._closed = False
         self._stops = Stops(name, self._send_stop)
         self._axis = ZaberAxis(url, settings, clock, name)
         self._pulses = ZaberPulses(self._axis, settings.pulses, name)
         try:
             self._identity = self._axis.open()
+            self._refuse_another_device()
+            self._told = frozenset(self._axis.flags_at_opening)
             self._check_turn_and_travel()
             self._axis.set("accel", steepest)
             if self._identity.has_triggers:
@@ -176,9 +180,9 @@ class ZaberStage(LineStage):
                     advice="Search the reference (home) first",
                     state="Nothing has moved",
                 )
+            self._refuse_untold(status)
             self._pulses.before_move(status.counts, target)
-            if status.flags:
-                self._axis.forget_flags()
+            self._forget_flags(status)
             self._axis.set("maxspeed", native)
             self._axis.move(target)
         self._target, self._homing = target, False
@@ -188,8 +192,7 @@ class ZaberStage(LineStage):
         with self._stops.none_while("the search for the reference"):
             status = self._axis.standing("a search for the reference")
             self.disarm()
-            if status.flags:
-                self._axis.forget_flags()
+            self._forget_flags(status)
             self._axis.home()
         self._target, self._homing = None, True
 
@@ -206,7 +209,8 @@ class ZaberStage(LineStage):
             arrived = status.referenced and "NI" not in status.flags
         else:
             arrived = self._target is None or status.counts == self._target
-        if not arrived or (aim and status.faulty):
+        if not arrived or (aim and status.grave):
+            self._told = frozenset(status.flags)
             raise DeviceError(
                 self.name,
                 f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
@@ -239,7 +243,7 @@ class ZaberStage(LineStage):
         self._pulses.disarm()
 
     def describe(self) -> dict[str, str | int | float]:
-        pulses = self._pulses.settings
+        pulses, flags = self._pulses.settings, meaning_of(self._axis.flags_at_opening)
         return {
             "model": f"Zaber device {self._identity.number}",
             "serial": self._identity.serial,
@@ -251,6 +255,7 @@ class ZaberStage(LineStage):
             "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
+            **found_at_opening("" if flags is None else flags.text, self._axis.found.said),
             **self._travel.described(),
         }
 
@@ -266,6 +271,33 @@ class ZaberStage(LineStage):
                 self.disarm()
             with contextlib.suppress(DeviceError):
                 self._axis.close()
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        self._axis.found.keep_in(store)
+
+    def _refuse_untold(self, status: ZaberAxisStatus) -> None:
+        """DeviceError, once, for what happened to the standing stage since its last move."""
+        if not (status.grave & (SLIPPED | LOST)) - self._told:
+            return
+        self._told = frozenset(status.flags)
+        fault = meaning_of(status.flags)
+        assert fault is not None, status.flags
+        raise DeviceError(
+            self.name,
+            f"since its last move something happened to it: {fault.text}",
+            reply=status.raw,
+            expected="a stage that stood still",
+            advice=f"{fault.advice}. What was measured since then may have been at another angle",
+            state=f"Nothing has moved by this; it stands at {self._travel.degrees(status.counts)}",
+        )
+
+    def _forget_flags(self, status: ZaberAxisStatus) -> None:
+        if status.flags:
+            self._axis.forget_flags()
+        self._told = frozenset()
+
+    def _refuse_another_device(self) -> None:
+        refuse_another(self.name, self._settings.serial, self._identity.serial)
 
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop("estop" if hard else "stop")

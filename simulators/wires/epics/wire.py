@@ -35,6 +35,8 @@ class EpicsBuild:
         fastest: VMAX; 0: none.
         home_at: step at which its home switch is.
         switch_at: step at which its upper limit switch ends a move.
+        late: s after the write of VAL until DMOV falls, as of a slow IOC.
+        early: s before the end of a move at which DMOV rises.
     """
 
     counts_per_turn: int = 360_000
@@ -44,6 +46,8 @@ class EpicsBuild:
     fastest: float = 0.0
     home_at: int = 0
     switch_at: int | None = None
+    late: float = 0.0
+    early: float = 0.0
 
     @classmethod
     def matching(cls, settings: EpicsSettings) -> Self:
@@ -70,11 +74,11 @@ class MotorRecord:
         self.state: dict[str, float | str] = {
             ".VAL": 0.0, ".EGU": build.unit, ".MRES": self._step, ".HLM": build.high, ".LLM": build.low,
             ".VMAX": build.fastest, ".VBAS": 0.0, ".VELO": 1.0, ".ACCL": 0.2, ".DESC": "simulated axis",
-            ".SPMG": 3.0, ".SET": 0.0, ".LVIO": 0.0, ".STOP": 0.0, ".HOMF": 0.0, ".HOMR": 0.0,
+            ".SPMG": 3.0, ".SET": 0.0, ".DISP": 0.0, ".LVIO": 0.0, ".STOP": 0.0, ".HOMF": 0.0, ".HOMR": 0.0,
         }  # fmt: skip
         moved: dict[str, Callable[[], float]] = {
             ".RBV": lambda: self.motor.position() * self._step,
-            ".DMOV": lambda: float(not self.motor.moving()),
+            ".DMOV": lambda: float(not self._shows_motion()),
             ".MOVN": lambda: float(self.motor.moving()),
             ".MSTA": lambda: float(self._bits()),
         }
@@ -97,8 +101,12 @@ class MotorRecord:
             return PvValue(value, labels[int(value)] if labels else "")
 
     def write(self, suffix: str, value: float | str) -> None:
-        """Set a field, as a client does. KeyError: it cannot be set."""
+        """Set a field, as a client does; a disabled record ignores it. KeyError: it cannot be set."""
         with self._lock:
+            if self.state[".DISP"] and suffix != ".DISP":
+                return
+            if suffix == ".SPMG" and value not in (3.0, "Go"):
+                self._stop(1.0)
             if (act := self._acts.get(suffix)) is not None:
                 act(float(value))
             else:
@@ -131,6 +139,10 @@ class MotorRecord:
         if wanted:
             self._homed = True  # by the end of the move; a stop takes it back
             self._start(self._build.home_at)
+
+    def _shows_motion(self) -> bool:
+        now, move = self.clock.now(), self.motor.move
+        return move.begin + self._build.late <= now < move.end - self._build.early
 
     def _stop(self, wanted: float) -> None:
         if wanted:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
@@ -153,6 +153,10 @@ class GcsAxis:
             if place is not None and 0 < way < abs(self.move.target - self.move.start):
                 self._replace(self.move.halted(place))
                 self._at_end = act
+
+    def disturb(self, beyond: Callable[[float], float]) -> None:
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
+        self._moves[-1] = replace(self.move, beyond=beyond)
 
     def reference(self, kind: str) -> None:
         """Start the reference move of a command FRF, FNL or FPL."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from simulators.devices.motion import TrapezoidMove
@@ -98,6 +98,11 @@ class SimulatedZaberAxis:
         """Standing flags, the gravest first."""
         standing = self.flags | (set() if self.homed else {"WR"}) | (set() if self.enabled else {"FO"})
         return sorted(standing, key=PRIORITY.index)
+
+    def disturb(self, beyond: Callable[[float], float], *flags: str) -> None:
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place; only these flags tell."""
+        self._moves[-1] = replace(self.move, beyond=beyond)
+        self.flags.update(flags)
 
     def start(self, now: float, target: int) -> None:
         """Move to `target`, or to the place where it is blocked."""

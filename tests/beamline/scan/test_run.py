@@ -31,6 +31,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind
 from drivers.frame_memory import FrameMemory
+from tests.beamline import fakes
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran, small
 
@@ -321,3 +322,31 @@ def test_two_scans_in_one_process_carry_their_own_metadata(tmp_path: Path) -> No
         lines = (result.path.parent / "events.jsonl").read_text(encoding="utf-8").splitlines()
         assert [json.loads(line)["event"] for line in lines] == [event.event for event in events]
     assert starts[1][0] > starts[0][1] + 4000
+
+
+def test_another_device_at_the_port_of_the_run_before_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {"model": "Zaber device 1", "serial": "11", "port": "/dev/ttyUSB0"}
+    for serial, port, warned in (
+        ("11", "/dev/ttyUSB0", False),
+        ("11", "/dev/ttyUSB0", False),
+        ("22", "/dev/ttyUSB0", True),
+        ("22", "/dev/ttyUSB0", False),
+        ("33", "/dev/ttyUSB1", False),
+    ):
+        now = said | {"serial": serial, "port": port}
+        monkeypatch.setattr(fakes.Stage, "describe", lambda stage, now=now: now)
+        ran = Ran(tmp_path, FakeInstrument())
+        assert ran.error is None
+        messages = [event.data["message"] for event in ran.of("warning")]
+        assert bool(messages) is warned
+        if warned:
+            assert "at /dev/ttyUSB0 there is model Zaber device 1, serial 22" in messages[0]
+            assert "it was model Zaber device 1, serial 11. If cables or ports were swapped" in messages[0]
+
+
+def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {"model": "m", "found_at_opening": "displaced while it stood (WM)"}
+    monkeypatch.setattr(fakes.Stage, "describe", lambda stage: said)
+    ran = Ran(tmp_path, FakeInstrument())
+    (warning,) = ran.of("warning")
+    assert warning.data["message"] == "stage: before it was opened: displaced while it stood (WM)."

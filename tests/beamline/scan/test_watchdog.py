@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -63,7 +64,9 @@ posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets
     ("kind", "frozen"),
     [("zaber", False), *(pytest.param(*one, marks=pytest.mark.slow) for one in OTHERS)],
 )
-def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Path, kind: str, frozen: bool) -> None:
+def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
+    tmp_path: Path, kind: str, frozen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clock = SystemClock()
     line = TriggerLine(clock)
     template, outputs = config_folder() / "instrument.yaml", kind != "pm16c"
@@ -73,6 +76,9 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
     ]
     controller = WIRES[kind].matching(load(template, words, {}).devices.stage.settings).controller(clock, line)
     log = tmp_path / WATCHDOG_LOG
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    speed = getattr(getattr(controller, "device", None), "axis", None)
+    before = None if speed is None else dict(speed.settings)
     with serve_tcp(controller) as url:
         config = load(template, [*words, f"devices.stage.port={url}"], {})
         (tmp_path / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -98,6 +104,8 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
         assert not controller.output_is_high(2)
         time.sleep(0.3)
         assert line.angle_at(clock.now()) == stood < 2.9  # it was on its way to 3
+        assert "a program that was killed left" in text and not list((tmp_path / "state").rglob("*.json"))
+        assert before is None or speed.settings == before
         log.unlink()
         told: list[str] = []
         with watched(tmp_path, lambda event: told.append(event.event)):
@@ -282,7 +290,8 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         assert stage.position() < 2.9  # it was on its way to 3
         stage.close()
     assert (served.values.get("blade", 0.0), served.values["M.STOP"], served.values["F.STOP"]) == (0.0, 1.0, 1.0)
-    stopped, shutter, mover, changer, crystal, disarmed = said
+    stopped, shutter, mover, changer, crystal, left, disarmed = said
+    assert re.match(r"stage: a program that was killed left \.VELO 28\.6\d+ for 1\.0", left)
     assert (crystal, served.values["E.STOP"]) == ("The monochromator was told to stop.", 1.0)
     assert changer == "The filter was told to stop."
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")

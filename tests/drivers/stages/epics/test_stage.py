@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 from uuid import uuid4
 
@@ -149,3 +150,48 @@ def test_an_ioc_that_never_was_or_is_gone_is_an_error_in_time(monkeypatch: pytes
         with pytest.raises(DeviceTimeout):
             stage.stop()
         stage.close()
+
+
+@pytest.mark.parametrize("build", [{"late": 0.6}, {"early": 0.6}, {"late": 0.6, "early": 0.6}], ids=str)
+def test_a_done_that_falls_late_or_comes_early_ends_no_move(build: dict[str, float]) -> None:
+    record, url, clock = _record(**build)
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    while stage.moving():
+        clock.sleep(0.02)
+    assert math.degrees(stage.wait(0.02)) == pytest.approx(20, abs=0.01)
+    assert abs(record.motor.position() - 20_000) <= 10
+
+
+@pytest.mark.parametrize(
+    ("act", "said"),
+    [
+        (lambda record: record.write(".SPMG", "Pause"), r"SPMG is Pause: somebody paused"),
+        (lambda record: record.write(".STOP", 1), r"no reason given"),
+        (lambda record: record.write(".VAL", 3.0), r"VAL is 3\.0: another client has sent it elsewhere"),
+    ],
+    ids=["paused", "stopped", "sent elsewhere"],
+)
+def test_what_ends_a_move_on_the_way_is_named_and_stands_is_said_of_what_was_seen_to_stand(
+    act: Callable[[MotorRecord], None], said: str
+) -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    clock.sleep(0.5)
+    act(record)
+    with pytest.raises(DeviceError, match=rf"stopped short of 20.*It stands at .*{said}"):
+        stage.wait(60)
+    before = record.motor.position()
+    clock.sleep(10)
+    assert record.motor.position() == before
+
+
+def test_a_disabled_record_that_takes_no_value_is_named() -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    record.write(".DISP", 1)
+    stage.start_move(math.radians(20), SPEED)
+    with pytest.raises(DeviceError, match=r"It stands at 0\.0000 deg, 0 counts: DISP is 1: the record takes no values"):
+        stage.wait(60)
+    stage.close()

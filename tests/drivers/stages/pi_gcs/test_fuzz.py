@@ -15,7 +15,7 @@ from tests.drivers.stages.fuzz_laws import (
 )
 from tests.drivers.stages.pi_gcs_rig import Rig
 
-REPLIES_TO_OPEN = 19
+REPLIES_TO_OPEN = 22
 """*IDN? CSV? ERR? SAI? #5 ERR? SPA? SPA? ERR? TRO? SVO? ERR? SVO? ERR? ACC? ERR? DEC? TMN? TMX?"""
 SAMPLES = [
     b"(c)2026 Physik Instrumente (PI) GmbH & Co. KG, C-863.12, 0, 1.2.1.0\n",

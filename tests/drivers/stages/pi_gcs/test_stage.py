@@ -13,7 +13,8 @@ from drivers.base.protocols import RotationStage
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.settings import StageFigures
 from drivers.testing.stages.bench import LONG, SPEED
-from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
+from simulators.wires.serial_url import register
+from tests.drivers.stages.pi_gcs_rig import COUNTS, NAMES, Rig
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def test_opening_asks_who_it_is_switches_the_servo_on_and_the_trigger_off(rig: R
     rig.open()
     assert rig.sent() == [
         "*IDN?", "CSV?", "SAI?", "#5", "SPA? 1 0xE", "SPA? 1 0xF", "TRO 2 0", "TRO? 2", "SVO? 1", "SVO 1 1", "SVO? 1",
-        "ACC 1 60", "ACC? 1", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
+        "VEL? 1", "SPA? 1 0xB", "ACC 1 60", "ACC? 1", "SPA? 1 0xC", "DEC 1 60", "DEC? 1", "TMN? 1", "TMX? 1",
     ]  # fmt: skip
     assert (rig.say("SVO?"), rig.say("TRO? 2")) == ("1=1", "2=0")
 
@@ -257,3 +258,35 @@ def test_limits_that_another_program_narrowed_are_the_controllers_to_name() -> N
     with pytest.raises(DeviceRefused, match=r"error 7, position out of limits.*TMX\?"):
         stage.start_move(math.radians(60), SPEED)
     assert not stage.moving()
+
+
+@pytest.mark.parametrize("code", [504, 1025, 333])
+def test_an_error_of_the_motion_is_that_of_its_move_or_told_by_the_next(code: int, rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(5), SPEED)
+    rig.controller.box.axis.error = code
+    with pytest.raises(DeviceError, match=rf"a fault at 5\.0000 deg \(error {code}"):
+        stage.wait(LONG)
+    stage.start_move(math.radians(6), SPEED)
+    stage.wait(LONG)
+    rig.controller.box.axis.error = code
+    with pytest.raises(DeviceError, match=rf"since its last move something happened to it: error {code}"):
+        stage.start_move(math.radians(7), SPEED)
+    stage.start_move(math.radians(7), SPEED)
+    assert math.degrees(stage.wait(LONG)) == pytest.approx(7, abs=0.01)
+
+
+def test_an_error_before_opening_is_in_the_description(rig: Rig) -> None:
+    rig.controller.box.axis.error = 1024
+    stage = rig.open()
+    assert "motion error" in str(stage.describe()["found_at_opening"])
+    stage.start_move(math.radians(5), SPEED)
+    stage.wait(LONG)
+
+
+def test_the_configured_serial_number_is_required(rig: Rig) -> None:
+    serial = str(rig.open().describe()["serial"])
+    rig.url = register(next(NAMES), rig)
+    rig.open(serial=serial).close()
+    with pytest.raises(DeviceRefused, match=rf"its serial number is {serial}.*swapped"):
+        rig.open(serial="42")

@@ -13,6 +13,7 @@ from drivers.base.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c.settings import RATES, PM16CSettings, steepest_code
 from drivers.stages.settings import StageFigures
 from drivers.testing.stages.bench import LONG, SPEED
+from simulators.wires.pm16c.box import Pm16cError
 from tests.drivers.pm16c_rig import COUNTS, Rig
 
 
@@ -186,3 +187,18 @@ def test_a_fifth_motor_cannot_start_and_the_controllers_words_are_given(rig: Rig
     with pytest.raises(DeviceError, match="MCC06 BUSY ERROR"):
         stage.start_move(math.radians(30), SPEED)
     assert stage.position() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [(2, "its pulse chip was busy"), (4, "a wrong place was refused"), (6, "busy and a move to a wrong")],
+)
+def test_error_flags_of_the_past_are_in_the_description(flag: int, words: str) -> None:
+    rig = Rig()
+    rig.controller.box.errors = Pm16cError(flag)
+    assert words in str(rig.open().describe()["found_at_opening"])
+    assert rig.controller.box.errors == 0
+
+
+def test_our_own_empty_line_is_no_error_of_the_past() -> None:
+    assert "found_at_opening" not in Rig().open().describe()

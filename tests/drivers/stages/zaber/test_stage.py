@@ -15,8 +15,9 @@ from drivers.base.protocols import RotationStage
 from drivers.stages.settings import StageFigures
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.testing.stages.bench import LONG, SPEED
+from simulators.wires.serial_url import register
 from simulators.wires.zaber.wire import Fault
-from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
+from tests.drivers.zaber_rig import NAMES, REPLIES_TO_OPEN, Rig
 
 
 @pytest.fixture
@@ -166,6 +167,81 @@ def test_a_stop_is_named_by_its_flag(rig: Rig) -> None:
     stage.stop()
     with pytest.raises(DeviceError, match=r"stopped short.*movement interrupted \(NI\)"):
         stage.wait(LONG)
+
+
+SLIPS = [
+    ("WS", "stalled and recovered"),
+    ("WM", "displaced while it stood"),
+    ("NC", "moved by its knob"),
+    ("WL", "a limit switch came where none was expected"),
+]
+
+
+@pytest.mark.parametrize(("flag", "words"), SLIPS)
+def test_a_slip_during_a_move_is_an_error_of_that_move_though_it_arrived(flag: str, words: str, rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    rig.clock.sleep(1.0)
+    rig.controller.device.axis.flags.add(flag)
+    with pytest.raises(DeviceError, match=rf"a fault at 30\.0000 deg.*stands at 30\.0000 deg.*{words} \({flag}\)"):
+        stage.wait(LONG)
+    stage.start_move(0.0, SPEED)  # it was told: the next move clears it
+    assert stage.wait(LONG) == 0.0
+
+
+@pytest.mark.parametrize(("flag", "words"), SLIPS)
+def test_a_slip_between_two_moves_is_told_once_by_the_next(flag: str, words: str, rig: Rig) -> None:
+    stage = rig.open()
+    stage.start_move(math.radians(10), SPEED)
+    stage.wait(LONG)
+    rig.controller.device.axis.disturb(lambda time: 5_000, flag)
+    with pytest.raises(DeviceError, match=rf"since its last move something happened to it: {words} \({flag}\).*15\."):
+        stage.start_move(math.radians(20), SPEED)
+    assert rig.controller.device.axis.position(rig.clock.now()) == 15_000
+    stage.start_move(math.radians(20), SPEED)
+    assert stage.wait(LONG) == pytest.approx(math.radians(20))
+
+
+@pytest.mark.parametrize(("flag", "words"), SLIPS)
+def test_a_slip_before_opening_is_in_the_description_and_refuses_nothing(flag: str, words: str, rig: Rig) -> None:
+    rig.controller.device.axis.flags.add(flag)
+    stage = rig.open()
+    assert stage.describe()["found_at_opening"] == f"{words} ({flag})"
+    stage.start_move(0.1, SPEED)
+    assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
+
+
+def test_the_configured_serial_number_is_required(rig: Rig) -> None:
+    rig.open(serial="123456").close()
+    with pytest.raises(DeviceRefused, match=r"its serial number is 123456.*Expected 42.*swapped.*Nothing has moved"):
+        rig.open(serial="42")
+
+
+class _Bus:
+    """Two devices with one address on one line: both hear everything, and both answer."""
+
+    def __init__(self, one: Rig, other: Rig, delay: bool) -> None:
+        self.clock, self._devices, self._late, self._delay = one.clock, (one, other), b"", delay
+
+    def receive(self, data: bytes) -> None:
+        for device in self._devices:
+            device.receive(data)
+
+    def transmit(self) -> bytes:
+        first, second = (device.transmit() for device in self._devices)
+        if not self._delay:
+            return first + second
+        late, self._late = self._late, second
+        return late + first if first else late
+
+
+@pytest.mark.parametrize("delay", [False, True], ids=["at once", "after the next request"])
+def test_two_devices_with_one_address_are_refused_before_anything_moves(delay: bool) -> None:
+    one, other = Rig(), Rig()
+    one.url = register(next(NAMES), _Bus(one, other, delay))
+    with pytest.raises(DeviceError, match=r"two devices answered one request.*same address"):
+        one.open()
+    assert one.controller.device.axis.position(one.clock.now()) == 0
 
 
 def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -> None:
