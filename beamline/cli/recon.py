@@ -40,6 +40,7 @@ from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
+from beamline.core.process import EndsWithParent
 from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
 from beamline.storage.volumes.registry import suffixes_text
@@ -206,6 +207,7 @@ _SHEET = ".png"
     is_flag=True,
     help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
 )
+@click.option("--beside-scan", "beside", is_flag=True, hidden=True, help="Ends with its scan; its output is the run's.")
 @heading(OUTPUT)
 @json_option
 def recon(
@@ -238,6 +240,7 @@ def recon(
     log: Path | None,
     verbose: bool,
     as_json: bool,
+    beside: bool,
     volumes: int | None,
     moves: bool | None,
     **values: Any,
@@ -314,7 +317,7 @@ def recon(
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
-        target=OutputPaths(output, page),
+        target=OutputPaths(output, page, replace=beside),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp, "any_setting": any_setting}),
         budget=budget,
@@ -359,7 +362,8 @@ def recon(
         shown = LogLines(sys.stderr, terminal=True) if verbose and not as_json else usual
         with logged(log, shown) as lines:
             sink = fan_out(last.append, made, *lines, shown)
-            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
+            scope = EndsWithParent(stop, sys.stdin.fileno()) if beside else stop
+            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=scope)
     done = last[-1]
     assert isinstance(done, VolumeDone)
     if not as_json:

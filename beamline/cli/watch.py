@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
 import webbrowser
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import click
 from beamline.cli.options import say
 from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
-from beamline.core.process import ChildProcess
+from beamline.core.process import ChildProcess, at_end_of
 
 if TYPE_CHECKING:
     from beamline.page.serve import PageServer
@@ -59,7 +58,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
         if tethered:
-            threading.Thread(target=_end_with_stdin, args=(server,), daemon=True).start()
+            at_end_of(sys.stdin.fileno(), lambda: _end(server))
         serve_shown(server, browse)
     finally:
         reader.close()
@@ -112,9 +111,8 @@ class PageBeside:
             self._say(f"Page, to {what}: {address.strip()}")
 
 
-def _end_with_stdin(server: PageServer) -> None:
-    """End this process when the process that started it lets it go or has died. Open pages are told within 3 s."""
-    sys.stdin.read()
+def _end(server: PageServer) -> None:
+    """End this process; open pages are told within 3 s."""
     server.stop()
     time.sleep(ENDS_WITHIN)
     os._exit(0)

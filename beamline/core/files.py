@@ -27,6 +27,11 @@ def parts_of(run: Path) -> list[Path]:
     return [run, *(part for _, part in sorted(_numbered(run).items()))]
 
 
+def run_of(folder: Path) -> Path:
+    """The folder of the run to which a folder belongs: itself, or that around a later part."""
+    return folder.parent if folder in parts_of(folder.parent)[1:] else folder
+
+
 def create_part(run: Path) -> Path:
     """The folder of a new part, after the others."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of
+from beamline.core.files import EVENTS, parts_of, run_of
 from beamline.core.process import json_object
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
@@ -35,9 +35,14 @@ class Watched:
         return self.scan.name if self.folder is None else self.folder.resolve().name
 
     @property
+    def run(self) -> Path | None:
+        """The folder of the run, which has the volume of all parts; None: a scan file alone."""
+        return None if self.folder is None else run_of(self.folder.resolve())
+
+    @property
     def volumes(self) -> tuple[Path, ...]:
-        """Paths where a volume of the run may be, the best first."""
-        return () if self.folder is None else (self.folder / RECON, self.folder / SNAPSHOT)
+        """Paths where a volume of the run may be."""
+        return () if self.run is None else (self.run / RECON, self.run / SNAPSHOT)
 
 
 def watched(path: Path) -> Watched:

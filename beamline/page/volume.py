@@ -31,11 +31,12 @@ class VolumeFile:
 
 
 def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
-    """The first existing one of these files."""
+    """The one of these files that was written last; None where none exists."""
+    found = []
     for path in candidates:
         with suppress(OSError):
-            return VolumeFile(path, path.stat().st_mtime_ns)
-    return None
+            found.append(VolumeFile(path, path.stat().st_mtime_ns))
+    return max(found, key=lambda file: file.changed_ns, default=None)
 
 
 @dataclass(frozen=True, eq=False)

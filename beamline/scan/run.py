@@ -194,6 +194,11 @@ class _Run:
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
 
+    @property
+    def volume(self) -> Path:
+        """The file of the run's volume: a run has one, also where it was resumed."""
+        return (self.series.run if self.series else self.folder) / RECON
+
     @cached_property
     def states(self) -> StateMachine:
         return StateMachine(self.sink)
@@ -221,10 +226,13 @@ class _Run:
 
     def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         path = self.folder / SCAN
-        command = None if live is None else live(path, self.folder / RECON)
+        command = None if live is None else live(path, self.volume)
         timeline = self.ready.timeline
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
+        if command is not None and self.volume.exists():
+            message = f"{self.volume} is of the views before: the volume of all parts takes its place when it is done"
+            self.sink(StateEntered(self.states.state, message))
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
@@ -263,7 +271,7 @@ class _Run:
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
         began = time.monotonic()
-        words = command(result.path, self.folder / RECON)
+        words = command(result.path, self.volume)
         recon = reconstruct(words, self.folder / RECON_LOG, self.sink, self.stop)
         return replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
 

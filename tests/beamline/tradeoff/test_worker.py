@@ -231,7 +231,7 @@ def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys
 
 @pytest.mark.slow
 def test_it_ends_when_whoever_wanted_its_result_is_gone() -> None:
-    program = "import time; from beamline.tradeoff.worker import end_with; end_with(0); print('up', flush=True); "
+    program = "import os, time; from beamline.core.process import at_end_of; at_end_of(0, lambda: os._exit(1)); print('up', flush=True); "
     command = [sys.executable, "-c", program + "time.sleep(100)"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     pipe = subprocess.PIPE
