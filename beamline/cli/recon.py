@@ -31,6 +31,7 @@ from beamline.cli.options import (
     json_option,
     parsed,
     refuse_shared,
+    scan_argument,
     volume_path,
 )
 from beamline.cli.recipe import config_option, recipe_text, repeating
@@ -90,7 +91,7 @@ _SHEET = ".png"
 )
 @heading(DATA)
 @config_option
-@click.argument("file", type=click.Path(path_type=Path))
+@scan_argument
 @heading(METHOD)
 @click.option(
     "-m",

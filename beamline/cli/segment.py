@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_events, json_option
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_events, json_option, volume_argument
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done
@@ -24,7 +24,7 @@ _PERCENT = FiniteRange(min=0, max=100)
 
 
 @click.command(cls=Repeatable)
-@click.argument("volume", type=click.Path(path_type=Path))
+@volume_argument
 @click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
 @click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
 @click.option(

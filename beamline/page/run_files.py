@@ -17,7 +17,10 @@ from beamline.core.process import json_object
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
+from beamline.scan.runs import DIED
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.interrupted import next_step
+from beamline.storage.writer_lock import QUIET, held
 
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
@@ -110,7 +113,8 @@ class Reader:
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
-        """Frames in the file, its status, seconds since the last frame, free bytes, name of the newest volume."""
+        """Frames in the file, its status, what can be done if its scan has died, seconds since the last frame, free
+        bytes, name of the newest volume."""
         self.events.refresh()
         try:
             progress = self.do(Recording.progress)
@@ -123,9 +127,11 @@ class Reader:
                 self._seen = frames, now
             age = now - self._seen[1]
         volume = newest(self.what.volumes)
+        died = status == "running" and not held(self.what.scan) and now - self.what.scan.stat().st_mtime > QUIET
         return {
             "frames": frames,
-            "status": status,
+            "status": DIED if died else status,
+            "next": next_step(self.what.scan) if died else "",
             "age_s": round(age, 1),
             "free": shutil.disk_usage(self.what.scan.parent).free,
             "volume": None if volume is None else f"{volume.path.name} {volume.changed_ns}",

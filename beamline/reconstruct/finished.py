@@ -33,6 +33,7 @@ from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
+from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
@@ -147,10 +148,10 @@ def require_finished(source: ScanSource, options: ReconOptions, warn: Warn) -> N
     n = source.image_key.size
     if not options.unfinished:
         raise DataError(
-            f"{source.path} is still being written, or its scan died. Follow it with --follow, or take the {n} "
-            "frames that are there with --unfinished."
+            f"{source.path} is not finished. {next_step(source.path)} --unfinished takes the {n} frames that are there "
+            "as they are. Nothing was written."
         )
-    warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
+    warn(f"{source.path} is not finished: the {n} frames that are there are used. {next_step(source.path)}")
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
