@@ -113,14 +113,14 @@ class Reader:
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
-        """Frames in the file, its status, what can be done if its scan has died, seconds since the last frame, free
-        bytes, name of the newest volume."""
+        """Frames in the file, its status, what can be done if its scan has died, seconds since the last frame, the
+        time of the newest, free bytes, name of the newest volume."""
         self.events.refresh()
         try:
             progress = self.do(Recording.progress)
-            frames, status = progress.frames, progress.status
+            frames, status, newest_frame = progress.frames, progress.status, progress.newest
         except NotReadyError:
-            frames, status = 0, "preparing"
+            frames, status, newest_frame = 0, "preparing", None
         now = time.time()
         with self._lock:
             if frames != self._seen[0]:
@@ -133,6 +133,7 @@ class Reader:
             "status": DIED if died else status,
             "next": next_step(self.what.scan) if died else "",
             "age_s": round(age, 1),
+            "newest": newest_frame,
             "free": shutil.disk_usage(self.what.scan.parent).free,
             "volume": None if volume is None else f"{volume.path.name} {volume.changed_ns}",
             "now": now,
