@@ -318,7 +318,7 @@ def recon(
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
-        target=OutputPaths(output, page, replace=beside),
+        target=OutputPaths(output, page),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp, "any_setting": any_setting}),
         budget=budget,

@@ -19,7 +19,8 @@ from beamline.core.errors import DataError
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
 RUNS = "runs"  # The default folder for the folders of runs
-SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"  # Files in the folder of a run
+SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
+CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 
 

@@ -23,7 +23,7 @@ from beamline.core.errors import (
     user_message,
 )
 from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
-from beamline.core.files import EVENTS
+from beamline.core.files import EVENTS, REPORT
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.sinks import Announcer, JsonLines
@@ -230,9 +230,7 @@ class _Run:
         timeline = self.ready.timeline
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
-        if command is not None and self.volume.exists():
-            message = f"{self.volume} is of the views before: the volume of all parts takes its place when it is done"
-            self.sink(StateEntered(self.states.state, message))
+        self._set_volume_aside()
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
@@ -252,6 +250,21 @@ class _Run:
         rehearse(self.ready.monitor)
         if follower is not None:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+
+    def _set_volume_aside(self) -> None:
+        """Rename volume and report of the views before, in a run that goes on: that of all parts gets their names."""
+        for path in (self.volume, self.volume.with_name(REPORT)):
+            if self.series is None or not path.exists():
+                continue
+            aside = path.with_stem(f"{path.stem}.before-{self.folder.name}")
+            try:
+                path.rename(aside)
+                message = f"{path.name}, of the views before, is {aside.name} now"
+                self.sink(StateEntered(self.states.state, message))
+            except OSError as error:  # Windows, where a viewer holds it open
+                self.sink(
+                    Warned(f"{path} could not be renamed ({error.strerror}): the run gets no volume of all parts.")
+                )
 
     def _prepare_memory(self) -> None:
         """Memory for the frames that may wait for the disk, before the first comes. At most a quarter of the free
