@@ -197,7 +197,7 @@ _SHEET = ".png"
 @click.option(
     "--write-config",
     type=click.Path(path_type=Path),
-    help="Write the options of this call as a recipe to this file (-: print it), and do nothing else.",
+    help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is done.",
 )
 @click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
 @click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
@@ -291,7 +291,7 @@ def recon(
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     files = {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint}
-    refuse_shared({**files, "--resume": resume, "--log": log})
+    refuse_shared({**files, "--resume": resume, "--log": log, "--write-config": write_config})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     whole, tries = follow or budget is not None, tried is not None
     for refused, why in (
@@ -341,8 +341,11 @@ def recon(
     if roi is not None and max_residual is not None and options.method.traits.direct:
         raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     if write_config is not None:
+        if typed is not None:
+            options.target.refuse_existing()
         _write_recipe(write_config, options.recipe)
-        return
+        if typed is None:
+            return
     clock = SystemClock()
     if tried is not None:
         _try_axes(options, tried, typed or Path(f"{file.stem}_axis{_SHEET}"), as_json)

@@ -126,6 +126,10 @@ def summary(found: Segmented, options: SegmentOptions) -> str:
         f"{'clusters':<12}{found.clusters.centres.size}, threshold {found.clusters.threshold:.3f} of the range",
         f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
     ]
+    if found.outside:
+        one = found.outside == 1
+        said = f"{'1 body' if one else f'{found.outside} bodies'} as bright outside the square {'is' if one else 'are'}"
+        lines.append(f"{'left out':<12}{said} no particle here; --crop none takes the whole volume, with its wall")
     if "d50" in figures:
         sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
         lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")

@@ -122,7 +122,7 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, length of a voxel along z, y, x, its unit, unit of values, method, views, windows of all times."""
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method, views, windows of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
