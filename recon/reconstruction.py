@@ -62,30 +62,11 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
-        Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `centre_zyx_mm`, `method`, `seconds`, and `settings`,
-        JSON of those that are not arrays. Written as a whole or not at all.
-
-        Raises:
-            ValueError: another suffix.
-            FileExistsError: nothing is overwritten.
+        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays.
         """
-        path = Path(path)
-        if path.suffix != ".npz":
-            raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")
-        if path.exists():
-            raise FileExistsError(f"{path} exists and is not overwritten; name another file")
         settings = {k: v for k, v in self.settings.items() if not isinstance(v, np.ndarray)}
-        partial = path.with_name(f".{path.name}.partial.npz")
-        try:
-            np.savez(
-                partial, volume=self.volume.data, voxel_mm=self.volume.grid.voxel_size,
-                slice_mm=self.volume.grid.spacing[0],
-                centre_zyx_mm=self.volume.grid.centre, method=self.method, seconds=self.seconds,
-                settings=json.dumps(settings, default=str),
-            )  # fmt: skip
-            partial.rename(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        told = json.dumps(settings, default=str)
+        self.volume.save(path, method=self.method, seconds=self.seconds, settings=told)
 
 
 def reconstruct(

@@ -33,3 +33,14 @@ def test_links_lead_somewhere(page: Path) -> None:
         leads_to = page.parent / name if name else page
         assert leads_to.exists(), target
         assert not anchor or anchor in anchors(leads_to), target
+
+
+@pytest.mark.parametrize("page", ["python.md", "tutorials.md"])
+def test_a_page_shows_examples_as_they_stand_in_their_files(page: str) -> None:
+    """A plain viewer shows no included file, so that the page holds the text."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    assert "--8<--" not in text
+    shown = re.findall(r"(?s)<!-- (docs/examples/\S+) -->\n```\w+\n(.*?)\n```\n", text)
+    assert len(shown) == len(re.findall("<!-- docs/examples/", text)) >= 3
+    for name, content in shown:
+        assert content == (ROOT / name).read_text(encoding="utf-8").rstrip(), name

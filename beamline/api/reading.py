@@ -18,10 +18,10 @@ from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
 from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
-from beamline.scan.resume import scan_file
 from beamline.scan.run_folder import SCAN
 from beamline.scan.runs import describe
 from beamline.scan.states import State
+from beamline.storage.interrupted import scan_file
 from beamline.storage.parts import JOINED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import NotReadyError, open_scan

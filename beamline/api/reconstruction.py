@@ -21,7 +21,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
-from beamline.scan.resume import scan_file
+from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import ReconRecord

@@ -17,7 +17,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.time_series import SeriesDone, WantedSeries
 from beamline.reconstruct.time_series import reconstruct_series as made_series
-from beamline.scan.resume import scan_file
+from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import ReconRecord

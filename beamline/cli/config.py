@@ -48,8 +48,9 @@ def print_schema() -> None:
 @click.command()
 @config_argument
 @set_option
+@click.option("--rehearse", is_flag=True, help="As `beamline scan --rehearse` would run it.")
 @json_option
-def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool) -> None:
     """Validate CONFIG. Nothing moves.
 
     Prints the timeline of the scan: speed, taxi, angular step in counts, motion blur and rolling-shutter skew in
@@ -61,7 +62,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     from beamline.scan.preflight import dry_run, refuse_violations
 
     with json_events(as_json) as sink:
-        worked = dry_run(load(file, overrides))
+        worked = dry_run(load(file, overrides, rehearse=rehearse))
         if not as_json:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, json_option, parsed, refuse_shared, volume_path
+from beamline.cli.options import json_events, json_option, parsed, refuse_shared, volume_argument, volume_path
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
@@ -41,7 +41,7 @@ def _output_path(text: str) -> Path:
 
 
 @click.command()
-@click.argument("volume", type=click.Path(path_type=Path))
+@volume_argument
 @click.option(
     "-o",
     "--output",

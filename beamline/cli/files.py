@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import POSITIVE, json_events, json_option
+from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
 from beamline.cli.scan_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
@@ -28,7 +28,7 @@ _PATH = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("file", type=_PATH)
+@scan_argument
 @scan_options
 @click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
 @click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
@@ -156,7 +156,7 @@ def _text(value: Any) -> str:
 
 
 @click.command()
-@click.argument("file", type=_PATH)
+@scan_argument
 @scan_options
 @click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
@@ -215,7 +215,7 @@ def recover(file: Path, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("source", type=_PATH, metavar="IN")
+@click.argument("source", type=_PATH, metavar="IN", callback=as_scan)
 @click.argument("output", type=_PATH, metavar="OUT.h5")
 @scan_options
 @click.option("--pixel-size-um", type=POSITIVE, help="Pixel size at the sample.")
@@ -264,7 +264,7 @@ def ingest(
 
 
 @click.command()
-@click.argument("scan", type=_PATH)
+@click.argument("scan", metavar="SCAN|RUN", type=_PATH, callback=as_scan)
 @click.option("-o", "--output", metavar="FILE", type=_PATH, required=True, help="The archive to write.")
 @click.option(
     "--codec",

@@ -13,7 +13,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.cli.options import POSITIVE, json_option, parsed, refuse_shared, volume_path
+from beamline.cli.options import POSITIVE, json_option, parsed, refuse_shared, volume_argument, volume_path
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing
@@ -64,11 +64,8 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
         yield read_model(volume), sink, SystemClock()
 
 
-_VOLUME = click.argument("volume", type=click.Path(path_type=Path))
-
-
 @click.command()
-@_VOLUME
+@volume_argument
 @click.option(
     "-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True, help="Its suffix names the format."
 )
@@ -101,7 +98,7 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 
 
 @click.command()
-@_VOLUME
+@volume_argument
 @click.option("-o", "--output", metavar="PATH.h5", type=click.Path(path_type=Path), required=True, help="New file.")
 @click.option(
     "--angles",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import json_option, set_option
+from beamline.cli.options import json_option, scan_argument, set_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@scan_argument
 @click.option("--follow", is_flag=True, help="Follow a scan that is still running.")
 @click.option(
     "--config",
@@ -72,6 +72,7 @@ def monitor(
     from beamline.report.contact_sheet import contact_sheet
     from beamline.storage.flag_legend import FrameFlags, counted
     from beamline.storage.readers.open import SourceOptions
+    from beamline.storage.rules.validate import scan_ended
 
     if overrides and config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
@@ -99,10 +100,11 @@ def monitor(
                 active = now
             said_of = verdict(source, found, limits)
             returned = [] if stopped() else returned_views(source)
+            ended = [finding.message for finding in scan_ended(source)]
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in found]))):
                 write_whole(sheet, contact_sheet(worst))
         altered = [said_of.altered] if said_of.altered else []
-        for fault in [*said_of.references, *altered]:
+        for fault in [*said_of.references, *altered, *ended]:
             sink(Warned(fault, time=clock.now()))
         n, alarmed, again, references = said_of.n_frames, said_of.alarmed, said_of.retaken, said_of.references
         done = {
@@ -118,7 +120,7 @@ def monitor(
         left_out = [f"Not looked at: {'; '.join(said_of.aside)}."] if said_of.aside else []
         back = [f"On the way back: {view.said()}." for view in returned]
         drift = [said_of.drift] if said_of.drift else []
-        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *drift, *left_out, *back, end]))
+        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *drift, *left_out, *back, *ended, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -80,6 +80,25 @@ def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parame
     return callback
 
 
+def as_scan(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
+    """A callback: the folder of a run stands for its scan with all parts."""
+    from beamline.storage.interrupted import scan_file  # here: help needs none of it
+
+    return scan_file(value)
+
+
+def _as_volume(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
+    from beamline.storage.interrupted import volume_file
+
+    return volume_file(value)
+
+
+scan_argument = click.argument("file", metavar="FILE|RUN", type=click.Path(path_type=Path), callback=as_scan)
+"""A scan: its file, or the folder of a run, which stands for its scan with all parts."""
+volume_argument = click.argument("volume", metavar="VOLUME|RUN", type=click.Path(path_type=Path), callback=_as_volume)
+"""A volume: its file, or the folder of a run, which stands for its recon.h5."""
+
+
 def volume_path(text: str) -> Path:
     """A path whose suffix names the format of a volume. ValueError for another."""
     from beamline.storage.volumes.files import format_of  # here: help needs none of it

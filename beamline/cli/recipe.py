@@ -20,10 +20,10 @@ from beamline.core.files import SETTINGS, require_regular, text_in
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
     "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
-    "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
+    "beside", "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
 )  # fmt: skip
 """Options of a single scan or call, which are not part of a recipe; a preset is in the name of the method."""
-_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")
+_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint", "beside")
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
 
 

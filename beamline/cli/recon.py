@@ -31,6 +31,7 @@ from beamline.cli.options import (
     json_option,
     parsed,
     refuse_shared,
+    scan_argument,
     volume_path,
 )
 from beamline.cli.recipe import config_option, recipe_text, repeating
@@ -40,6 +41,7 @@ from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
+from beamline.core.process import EndsWithParent
 from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
 from beamline.storage.volumes.registry import suffixes_text
@@ -89,7 +91,7 @@ _SHEET = ".png"
 )
 @heading(DATA)
 @config_option
-@click.argument("file", type=click.Path(path_type=Path))
+@scan_argument
 @heading(METHOD)
 @click.option(
     "-m",
@@ -195,7 +197,7 @@ _SHEET = ".png"
 @click.option(
     "--write-config",
     type=click.Path(path_type=Path),
-    help="Write the options of this call as a recipe to this file (-: print it), and do nothing else.",
+    help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is done.",
 )
 @click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
 @click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
@@ -206,6 +208,7 @@ _SHEET = ".png"
     is_flag=True,
     help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
 )
+@click.option("--beside-scan", "beside", is_flag=True, hidden=True, help="Ends with its scan; its output is the run's.")
 @heading(OUTPUT)
 @json_option
 def recon(
@@ -238,6 +241,7 @@ def recon(
     log: Path | None,
     verbose: bool,
     as_json: bool,
+    beside: bool,
     volumes: int | None,
     moves: bool | None,
     **values: Any,
@@ -287,7 +291,7 @@ def recon(
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     files = {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint}
-    refuse_shared({**files, "--resume": resume, "--log": log})
+    refuse_shared({**files, "--resume": resume, "--log": log, "--write-config": write_config})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     whole, tries = follow or budget is not None, tried is not None
     for refused, why in (
@@ -337,8 +341,11 @@ def recon(
     if roi is not None and max_residual is not None and options.method.traits.direct:
         raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     if write_config is not None:
+        if typed is not None:
+            options.target.refuse_existing()
         _write_recipe(write_config, options.recipe)
-        return
+        if typed is None:
+            return
     clock = SystemClock()
     if tried is not None:
         _try_axes(options, tried, typed or Path(f"{file.stem}_axis{_SHEET}"), as_json)
@@ -359,7 +366,8 @@ def recon(
         shown = LogLines(sys.stderr, terminal=True) if verbose and not as_json else usual
         with logged(log, shown) as lines:
             sink = fan_out(last.append, made, *lines, shown)
-            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
+            scope = EndsWithParent(stop, sys.stdin.fileno()) if beside else stop
+            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=scope)
     done = last[-1]
     assert isinstance(done, VolumeDone)
     if not as_json:

@@ -26,7 +26,7 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     """List the runs in FOLDER (./runs), newest first: sample, frames, state, size on the disk, flags.
 
     A run that was resumed is one line. A run that is not complete shows the frames in its files and the frames planned.
-    `died`: its process ended without a word; `beamline recover` keeps its frames.
+    `died`: its process ended without a word; a line says what can be done with it.
 
     Exit code: 0 also where there is no run, 2 no folder, or no port.
     """
@@ -52,6 +52,9 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    for run in found:
+        if run.next_step:
+            click.echo(f"{run.folder.name}: {run.next_step}", err=True)
 
 
 def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:

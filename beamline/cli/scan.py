@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
 )
 @set_option
+@click.option(
+    "--rehearse", is_flag=True, help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices."
+)
 @click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
 @click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
 @click.option(
@@ -60,6 +63,7 @@ def scan(
     file: Path | None,
     dry: bool,
     overrides: tuple[str, ...],
+    rehearse: bool,
     page: bool,
     no_live: bool,
     documents: str | None,
@@ -87,10 +91,12 @@ def scan(
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     if run is not None and (output is not None or (overrides and file is None)):
         raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+    if rehearse and run is not None:
+        raise click.UsageError("--rehearse begins a run: --resume goes on with its devices, simulated ones, too.")
     if run is not None and documents is not None:
         raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
     with json_events(as_json) as json_sink, ExitStack() as held:
-        config = None if file is None else load(file, overrides)
+        config = None if file is None else load(file, overrides, rehearse=rehearse)
         of_energies = _config_of_energies(config, run, documents)
         if of_energies is not None:
             if not dry:

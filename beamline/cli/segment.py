@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_events, json_option
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_events, json_option, volume_argument
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done
@@ -24,7 +24,7 @@ _PERCENT = FiniteRange(min=0, max=100)
 
 
 @click.command(cls=Repeatable)
-@click.argument("volume", type=click.Path(path_type=Path))
+@volume_argument
 @click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
 @click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
 @click.option(
@@ -126,6 +126,10 @@ def summary(found: Segmented, options: SegmentOptions) -> str:
         f"{'clusters':<12}{found.clusters.centres.size}, threshold {found.clusters.threshold:.3f} of the range",
         f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
     ]
+    if found.outside:
+        one = found.outside == 1
+        said = f"{'1 body' if one else f'{found.outside} bodies'} as bright outside the square {'is' if one else 'are'}"
+        lines.append(f"{'left out':<12}{said} no particle here; --crop none takes the whole volume, with its wall")
     if "d50" in figures:
         sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
         lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")

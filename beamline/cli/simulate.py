@@ -33,8 +33,24 @@ _SEED = click.IntRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
+def _print_effects(ctx: click.Context, param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        from beamline.simulate.effect_table import effects_text  # here: help needs none of it
+
+        click.echo(effects_text())
+        ctx.exit()
+
+
 @click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
 @click.argument("scene", metavar="SCENE")
+@click.option(
+    "--effects",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_effects,
+    help="Print all effects that a scene may name, with their parameters, and end.",
+)
 @click.option(
     "--explain", "explains", is_flag=True, help="Print the steps of computing a frame, in order, with the time of each."
 )

@@ -9,7 +9,7 @@ import click
 
 from beamline.cli.method_options import row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
-from beamline.cli.options import SEED, json_option
+from beamline.cli.options import SEED, json_option, scan_argument
 from beamline.cli.recipe import repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
@@ -27,7 +27,7 @@ from recon.methods import BASELINE, DEFAULT, names
 )
 @heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
-@click.argument("file", type=click.Path(path_type=Path))
+@scan_argument
 @click.option(
     "-m",
     "--method",

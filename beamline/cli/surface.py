@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.options import FiniteRange, json_option, parsed, refuse_shared
+from beamline.cli.options import FiniteRange, json_option, parsed, refuse_shared, volume_argument
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
@@ -24,7 +24,7 @@ def _mesh_path(text: str) -> Path:
 
 
 @click.command()
-@click.argument("volume", type=click.Path(path_type=Path))
+@volume_argument
 @click.option("-o", "--output", metavar="PATH", callback=parsed(_mesh_path), required=True,
               help=f"Its suffix names the format: {', '.join(MESHES)}.")  # fmt: skip
 @click.option("--level", type=FiniteRange(), help="Value at the surface. Default: half-way between air and matter.")

@@ -11,8 +11,8 @@ from beamline.cli.watch import bind_option, port_option, serve_shown
 
 
 @click.command()
-@click.argument("volume", metavar="VOLUME[::NAME]")
-@click.argument("other", metavar="[OTHER[::NAME]]", required=False)
+@click.argument("volume", metavar="VOLUME[::NAME]|RUN")
+@click.argument("other", metavar="[OTHER[::NAME]|RUN]", required=False)
 @port_option
 @bind_option
 @click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
@@ -21,7 +21,7 @@ from beamline.cli.watch import bind_option, port_option, serve_shown
 def view(
     volume: str, other: str | None, port: int, bind: str, browse: bool, in_napari: bool, labels: Path | None
 ) -> None:
-    """Show VOLUME as a page in the browser: slices, zoom, grey window, histogram, profile along a line.
+    """Show VOLUME, or the volume of RUN, as a page in the browser: slices, zoom, grey window, histogram, profile.
 
     OTHER is shown below it at the same places, and the difference where both have the same shape. Without OTHER the FBP
     is, where `beamline recon` kept one beside a doubtful volume. Of a volume above 512 MB slices across y and x are
@@ -55,6 +55,9 @@ def view(
 
 
 def _named(said: str) -> tuple[Path, str | None]:
-    """FILE::NAME as the file and the array in it; a file that has such a name itself comes first."""
+    """FILE::NAME as the file and the array in it; a file that has such a name itself comes first. Of the folder of a
+    run, its volume."""
+    from beamline.storage.interrupted import volume_file
+
     path, separator, name = said.rpartition("::")
-    return (Path(path), name) if separator and not Path(said).exists() else (Path(said), None)
+    return (Path(path), name) if separator and not Path(said).exists() else (volume_file(Path(said)), None)

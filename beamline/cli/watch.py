@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import threading
 import time
 import webbrowser
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import click
 from beamline.cli.options import say
 from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
-from beamline.core.process import ChildProcess
+from beamline.core.process import ChildProcess, at_end_of
 
 if TYPE_CHECKING:
     from beamline.page.serve import PageServer
@@ -35,7 +34,7 @@ bind_option = click.option(
 
 
 @click.command()
-@click.argument("path", metavar="[RUN|FILE]", required=False, type=click.Path(path_type=Path, exists=True))
+@click.argument("path", metavar="[RUN|FILE|RUNS]", required=False, type=click.Path(path_type=Path, exists=True))
 @click.option("--control", is_flag=True, help="A second address, from which the scan can be paused and ended.")
 @port_option
 @bind_option
@@ -44,22 +43,29 @@ bind_option = click.option(
 def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
     """Show the run in the folder RUN, or a scan FILE, as a page in the browser: views, flags, volume, states, log.
 
-    Without RUN: the running scan of ./runs, else its newest run. The page only reads; it cannot slow the scan down or
-    harm it. It is served to this machine alone: from elsewhere use an ssh tunnel, or --bind (not encrypted).
+    Of a folder of RUNS (./runs, unless given): the running scan, else the newest run. The page only reads; it cannot
+    slow the scan down or harm it. It is served to this machine alone: from elsewhere use an ssh tunnel, or --bind (not
+    encrypted).
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
     from beamline.page.app import page  # these load HDF5 and the server, which `scan -h` does not need
     from beamline.page.run_files import Reader, watched
     from beamline.page.serve import open_port, start
-    from beamline.scan.runs import newest
+    from beamline.scan.runs import newest, runs_in
+    from beamline.storage.interrupted import next_step
+    from beamline.storage.writer_lock import held
 
-    reader = Reader(watched(path or newest(Path(RUNS))))
+    folder = path or Path(RUNS)
+    what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
+    if not held(what.scan) and (said := next_step(what.scan)):
+        click.echo(said, err=True)
+    reader = Reader(what)
     try:
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
         if tethered:
-            threading.Thread(target=_end_with_stdin, args=(server,), daemon=True).start()
+            at_end_of(sys.stdin.fileno(), lambda: _end(server))
         serve_shown(server, browse)
     finally:
         reader.close()
@@ -112,9 +118,8 @@ class PageBeside:
             self._say(f"Page, to {what}: {address.strip()}")
 
 
-def _end_with_stdin(server: PageServer) -> None:
-    """End this process when the process that started it lets it go or has died. Open pages are told within 3 s."""
-    sys.stdin.read()
+def _end(server: PageServer) -> None:
+    """End this process; open pages are told within 3 s."""
     server.stop()
     time.sleep(ENDS_WITHIN)
     os._exit(0)

@@ -291,8 +291,8 @@ class DeviceSection(Section):
         if taken is None:
             with_outputs = [kind for kind, driver in STAGES.items() if driver.Settings.pulse_output is not None]
             raise ValueError(
-                f"a {self.stage.kind} stage has no digital output for a shutter; set shutter.kind: manual, or use the "
-                f"output of another controller (stage.kind {' or '.join(with_outputs)})"
+                f"shutter.kind: a {self.stage.kind} stage has no digital output for a shutter; set it to manual, or "
+                f"use the output of another controller (stage.kind {' or '.join(with_outputs)})"
             )
         if shutter.output == taken:
             raise ValueError(f"shutter.output {taken} is the output that the stage's trigger pulses come from")

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from beamline.config.tree import KeyPath, Tree
 
 Schema = Mapping[str, Any]
+_OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
@@ -21,18 +22,47 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
     faults: dict[KeyPath, str] = {}
-    for found in error.errors(include_url=False):
+    all_found = error.errors(include_url=False)
+    real = _keys_of_real(all_found, tree.data, schema)
+    for found in all_found:
         missing = found["type"] == "missing" and isinstance(found["loc"][-1], str)  # not a missing item of a list
         path = _path(found["loc"], tree.data, missing)
         if found["type"].startswith("union_tag"):
             path = (*path, found["ctx"]["discriminator"].strip("'"))
             missing = found["type"] == "union_tag_not_found"
+        if path and path[-1] in (keys := real.get(path[:-1], [])):
+            if path[-1] == keys[0]:
+                faults[path] = f"{tree.origin(path)}: {_keys_said(path[:-1], keys, tree.data)}"
+            continue
         sentence = _sentence("missing" if missing else found["type"], path, found["msg"], tree.data, schema)
-        faults.setdefault(path, f"{tree.origin(path)}: {sentence}")
+        place = tree.origin((*path, *_key_named(found["type"], found["msg"])))
+        faults.setdefault(path, f"{place}: {sentence}")
     # A list with a wrong item may also seem too short.
     lists = {path for path in faults if isinstance(_value(tree.data, path), list)}
     items = {path[:-1] for path in faults if path}
     return [said for path, said in faults.items() if path not in lists & items]
+
+
+def _keys_of_real(found: Sequence[Any], data: Any, schema: Schema) -> dict[KeyPath, list[str]]:
+    """Of each group of a simulated device: the keys that it does not have, and its real counterpart has."""
+    keys: dict[KeyPath, list[str]] = {}
+    for each in found:
+        path = _path(each["loc"], data, False)
+        if each["type"] != "extra_forbidden" or not path:
+            continue
+        group = _value(data, path[:-1])
+        others = [key for branch in _at(schema, path[:-1], None) for key in branch.get("properties", {})]
+        if str(group.get("kind", "")).startswith("simulated") and path[-1] in others:
+            keys.setdefault(path[:-1], []).append(str(path[-1]))
+    return keys
+
+
+def _keys_said(group: KeyPath, keys: Sequence[str], data: Any) -> str:
+    name, kind = ".".join(map(str, group)), _value(data, group)["kind"]
+    return (
+        f"{name}: {', '.join(keys)} belong{'s' if len(keys) == 1 else ''} to a real device, and its kind is {kind}; "
+        "leave out what it does not have, or take the real configuration as it is: `beamline scan CONFIG --rehearse`"
+    )
 
 
 def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
@@ -53,10 +83,17 @@ def _has(data: Any, part: str | int) -> bool:
     return isinstance(data, dict) and part in data
 
 
+def _key_named(kind: str, message: str) -> KeyPath:
+    """The path of the key, within its group, with which the message of a group's validator begins."""
+    words = message.removeprefix(_OF_VALIDATOR).split(maxsplit=1)
+    return tuple(words[0].rstrip(":,").split(".")) if kind == "value_error" and words else ()
+
+
 def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema) -> str:
     name = ".".join(map(str, path)) or "the configuration"
     if kind == "value_error":
-        return f"{name}: {message.removeprefix('Value error, ')}"
+        said = message.removeprefix(_OF_VALIDATOR)
+        return f"{name}: {said}" if path else said
     if kind == "extra_forbidden":
         keys = [key for branch in _at(schema, path[:-1], data) for key in branch.get("properties", {})]
         return f"{name} is not a known key{_nearest(path[-1], keys)}; legal keys there: {', '.join(keys)}"

@@ -25,6 +25,7 @@ from beamline.config.models import (
     RandomAngles,
     SectorAngles,
 )
+from beamline.config.rehearsal import rehearsal
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
@@ -35,7 +36,13 @@ from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
 
-def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
+def load(
+    path: str | Path,
+    overrides: Iterable[str] = (),
+    environment: Mapping[str, str] | None = None,
+    *,
+    rehearse: bool = False,
+) -> Config:
     """Read and validate a configuration file.
 
     Later wins: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value` overrides. File names in
@@ -43,6 +50,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
 
     Args:
         environment: os.environ unless given.
+        rehearse: with the simulated counterpart of each device of a real instrument; see `rehearsal`.
 
     Raises:
         ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
@@ -57,7 +65,16 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment)
-    return _validated(tree, str(path))
+    if not rehearse:
+        return _validated(tree, str(path))
+    simulation = tree.data.pop("simulation", None)
+    try:
+        config = _validated(tree, str(path))
+    except ConfigError:
+        if simulation is None:
+            raise
+        config = _validated(Tree({**tree.data, "simulation": simulation}, tree.origins), str(path))
+    return _validated(Tree(rehearsal(config, simulation), tree.origins), str(path))
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:

@@ -212,13 +212,18 @@ class Config(Section):
         if any(simulated.values()) and not all(simulated.values()):
             unreal = ", ".join(name for name, value in simulated.items() if value)
             real = ", ".join(name for name, value in simulated.items() if not value)
+            few_simulated = 2 * sum(simulated.values()) <= len(simulated)
+            odd = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
-                f"simulated devices cannot see real ones: {unreal} simulated, {real} real; make all simulated or none"
+                f"devices.{odd}: simulated devices cannot see real ones: {unreal} simulated, {real} real; make all "
+                "simulated or none. `beamline scan CONFIG --rehearse` takes a real configuration with simulated devices"
             )
         if any(simulated.values()) and self.simulation is None:
-            raise ValueError("simulated devices need a simulation section; `simulation: {}` takes its defaults")
+            raise ValueError(
+                "devices.camera: simulated devices need a simulation section; `simulation: {}` takes its defaults"
+            )
         if self.simulation is not None and not any(simulated.values()):
-            raise ValueError("the simulation section belongs to simulated devices and every device is real; remove it")
+            raise ValueError("simulation: belongs to simulated devices, and every device is real; remove the section")
         return self
 
     @model_validator(mode="after")

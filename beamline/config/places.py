@@ -154,4 +154,4 @@ FilterConfig = NoFilter | NamedFilter | MotorFilter | EpicsFilter
 
 def _refuse_equal(places: Mapping[str, float | str]) -> None:
     if len(set(places.values())) < len(places):
-        raise ValueError("two places have one value, so that nobody could tell them apart")
+        raise ValueError("places: two have one value, so that nobody could tell them apart")

@@ -16,7 +16,10 @@ from drivers.stages.settings import ANGULAR, Key
 
 
 class Section(BaseModel):
-    """A frozen group of keys. It refuses unknown keys, and `yes` for a number."""
+    """A frozen group of keys. It refuses unknown keys, and `yes` for a number.
+
+    What a validator of a group says begins with the key that is to be looked at, whose line the message then has.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 

@@ -20,12 +20,19 @@ from beamline.core.errors import DataError
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
 RUNS = "runs"  # The default folder for the folders of runs
+SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
+CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 
 
 def parts_of(run: Path) -> list[Path]:
     """The folders of a run's parts, in order: its own, and one for each time that it was resumed."""
     return [run, *(part for _, part in sorted(_numbered(run).items()))]
+
+
+def run_of(folder: Path) -> Path:
+    """The folder of the run to which a folder belongs: itself, or that around a later part."""
+    return folder.parent if folder in parts_of(folder.parent)[1:] else folder
 
 
 def create_part(run: Path) -> Path:

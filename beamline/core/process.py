@@ -9,17 +9,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from enum import Enum, auto
 from pathlib import Path
 from typing import Any, Self, TextIO
 
 import psutil
 
+from beamline.core.errors import INTERRUPTED
+from beamline.core.stop import StopScope
+
 _POLL = 0.2  # real s between two questions whether the process should stop
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
+ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
+_LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
 
@@ -181,6 +186,52 @@ class ChildProcess:
                 self._silent_since = time.monotonic()
                 self._on_line(line)
         self._on_end()
+
+
+def at_end_of(pipe: int, act: Callable[[], object]) -> None:
+    """Call `act`, in a thread of its own, when the file descriptor `pipe` ends: the process at its other end is dead.
+
+    Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
+    """
+
+    def wait() -> None:
+        with suppress(OSError):
+            while os.read(pipe, 1024):
+                pass
+        act()
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
+class EndsWithParent:
+    """A stop scope of a child process with a tether: it interrupts the work when the parent process has died.
+
+    Work that does not ask in time is ended where it is, after _LAST_WORK real s.
+
+    Args:
+        scope: asks for an early end otherwise.
+        pipe: the file descriptor that ends with the parent.
+    """
+
+    def __init__(self, scope: StopScope, pipe: int) -> None:
+        self._scope, self._orphaned = scope, threading.Event()
+        at_end_of(pipe, self._end)
+
+    @contextmanager
+    def __call__(self) -> Iterator[Callable[[], bool]]:
+        with self._scope() as stop_requested:
+
+            def asked() -> bool:
+                if self._orphaned.is_set():
+                    raise KeyboardInterrupt(ORPHANED)
+                return stop_requested()
+
+            yield asked
+
+    def _end(self) -> None:
+        self._orphaned.set()
+        time.sleep(_LAST_WORK)
+        os._exit(INTERRUPTED)
 
 
 def with_our_path() -> dict[str, str]:

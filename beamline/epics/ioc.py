@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import math
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.page.run_files import Reader, watched
 from beamline.scan.control import Verb, tell
-from beamline.scan.runs import newest
+from beamline.scan.runs import DIED, newest
+from beamline.scan.states import State
 from beamline.storage.hdf5 import NotReadyError
 
 
@@ -31,7 +34,7 @@ class RunValues:
     run: str = _pv("Run", "folder of the run", "")
     sample: str = _pv("SampleName", "name of the sample", "")
     file: str = _pv("FileName", "scan file", "")
-    state: str = _pv("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done ...", "idle")
+    state: str = _pv("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done, died ...", "idle")
     message: str = _pv("Message", "what the scan said last", "")
     planned: int = _pv("ImagesPlanned", "frames that the scan takes in all", -1)
     exposed: int = _pv("ImagesCollected", "frames exposed", 0)
@@ -50,22 +53,96 @@ class RunValues:
     free: float = _pv("DiskFree", "of the disk with the scan file", math.nan, "GB")
     age: float = _pv("FrameAge", "since the last frame came into the file", math.nan, "s")
 
-    def after(self, lines: Iterable[str]) -> RunValues:
+
+class Severity(IntEnum):
+    """Severities of EPICS alarms."""
+
+    NO_ALARM = 0
+    MINOR = 1
+    MAJOR = 2
+    INVALID = 3
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """When a value was so, s since the Unix epoch, and its alarm."""
+
+    time: float
+    severity: Severity = Severity.NO_ALARM
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class StampedValues:
+    """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
+
+    Attributes:
+        began: stamp of what nothing has set yet.
+    """
+
+    values: RunValues
+    began: float
+    stamps: Mapping[str, Stamp] = field(default_factory=dict)
+
+    def stamp(self, name: str) -> Stamp:
+        """The stamp of a value: INVALID where the value is not known."""
+        value, stamp = getattr(self.values, name), self.stamps.get(name, Stamp(self.began))
+        unknown = value == -1 or value != value
+        return replace(stamp, severity=Severity.INVALID, message="not known") if unknown else stamp
+
+    def after(self, lines: Iterable[str]) -> StampedValues:
         """The values after these further lines of the log."""
-        now = self
+        values, stamps = self.values, dict(self.stamps)
         for line in lines:
             event = json.loads(line)
             take = _TAKEN.get(str(event.get("event")))
             if take is not None:
-                now = replace(now, **take(now, event))
-        return now
+                taken = take(values, event)
+                values = replace(values, **taken)
+                severity = _severity(event)
+                for name in taken:
+                    worst = severity if name in _ALARMED else Severity.NO_ALARM
+                    stamps[name] = Stamp(float(event["time"]), worst, values.message if worst else "")
+        return replace(self, values=values, stamps=stamps)
 
-    def with_file(self, seen: Mapping[str, Any]) -> RunValues:
-        """The same with what the file says: `page.run_files.Reader.state`."""
-        stored = int(seen["frames"])
-        state = seen["status"] if not self.run and seen["status"] != "running" else self.state
-        percent = 100.0 * stored / self.planned if self.planned > 0 else self.percent
-        return replace(self, stored=stored, percent=percent, state=state, free=seen["free"] / 1e9, age=seen["age_s"])
+    def with_file(self, seen: Mapping[str, Any], now: float) -> StampedValues:
+        """The same with what the file says at the time `now`: `page.run_files.Reader.state`."""
+        before, stored, status = self.values, int(seen["frames"]), str(seen["status"])
+        state = status if status == DIED or (not before.run and status != "running") else before.state
+        percent = 100.0 * stored / before.planned if before.planned > 0 else before.percent
+        frame = Stamp(now if seen["newest"] is None else float(seen["newest"]))
+        stamps = {**self.stamps, "stored": frame, "percent": frame, "free": Stamp(now), "age": Stamp(now)}
+        if state != before.state:
+            stamps["state"] = Stamp(now, _OF_STATE.get(state, Severity.NO_ALARM), str(seen["next"]))
+        values = replace(
+            before, stored=stored, percent=percent, state=state, free=seen["free"] / 1e9, age=seen["age_s"]
+        )
+        return replace(self, values=values, stamps=stamps)
+
+    def unreadable(self, why: str) -> StampedValues:
+        """The same where the file cannot be read: what it says is as old as its stamp, and INVALID."""
+        old = {name: replace(self.stamp(name), severity=Severity.INVALID, message=why) for name in _OF_FILE}
+        return replace(self, stamps={**self.stamps, **old})
+
+
+_OF_FILE = ("stored", "percent", "free", "age")
+_ALARMED = ("state", "message", "last_flag", "warnings", "alarms")
+"""Values whose severity is that of the event that set them."""
+_OF_STATE = {
+    State.FAILED: Severity.MAJOR, DIED: Severity.MAJOR, State.ABORTED: Severity.MAJOR,
+    State.STOPPED: Severity.MINOR, State.PAUSED: Severity.MINOR,
+}  # fmt: skip
+_OF_LEVEL = {"alarm": Severity.MAJOR, "warn": Severity.MINOR}
+
+
+def _severity(event: Mapping[str, Any]) -> Severity:
+    """The severity of an event, by its state, level or kind."""
+    kind = event["event"]
+    if kind == "state":
+        return _OF_STATE.get(event["state"], Severity.NO_ALARM)
+    if kind == "flag":
+        return _OF_LEVEL.get(event.get("level", ""), Severity.NO_ALARM)
+    return {"failed": Severity.MAJOR, "warning": Severity.MINOR}.get(kind, Severity.NO_ALARM)
 
 
 def _number(value: Any) -> float:
@@ -88,26 +165,28 @@ def _frame(now: RunValues, event: Mapping[str, Any]) -> dict[str, Any]:
 def _flag(now: RunValues, event: Mapping[str, Any]) -> dict[str, Any]:
     if "check" not in event:  # a rule of the file
         return {}
-    alarm = event["level"] == "alarm"
-    said = f"{event['check']} {event['level']}, frame {event['frame']}: {event['advice']}"
-    return {"alarms": now.alarms + alarm, "warnings": now.warnings + (not alarm), "last_flag": said}
+    said = {"last_flag": f"{event['check']} {event['level']}, frame {event['frame']}: {event['advice']}"}
+    counted = {"alarm": {"alarms": now.alarms + 1}, "warn": {"warnings": now.warnings + 1}}
+    return {**said, **counted.get(event["level"], {})}
 
 
 _TAKEN = {
     "run_started": lambda now, event: {
         "run": str(event["folder"]), "sample": str(event["sample"]), "file": str(event["path"]),
-        "planned": int(event["n_frames"]),
+        "planned": int(event["n_frames"]), "warnings": 0, "alarms": 0,
     },
     "state": _state,
     "frame": _frame,
     "flag": _flag,
     "beam": lambda now, event: {"beam": _number(event["value"])},
     "warning": lambda now, event: {"message": str(event["message"])},
+    "failed": lambda now, event: {} if "source" in event else {"message": str(event["message"])},
     "snapshot": lambda now, event: {"views": int(event["n_views"]), "residual": _number(event.get("unlearnt"))},
     "scan_done": lambda now, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan},
 }  # fmt: skip
 
 
+_DEVICE, _UNDEFINED = 1, 6  # alarm_t.status of EPICS's normative types
 PERIOD = 0.5  # s between two looks at the run
 _TYPES: dict[str, str] = {"str": "s", "int": "l", "float": "d"}
 
@@ -120,13 +199,22 @@ class RunServer:
         address: to listen at.
         control: verbs are taken, from everybody who reaches the address.
         say: takes a line for each verb.
+        now: a clock, s since the Unix epoch.
 
     Raises:
         ConfigError: p4p is not installed.
         DataError: the address cannot be listened at.
     """
 
-    def __init__(self, runs: Path, prefix: str, address: str, control: bool, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        runs: Path,
+        prefix: str,
+        address: str,
+        control: bool,
+        say: Callable[[str], None],
+        now: Callable[[], float] = time.time,
+    ) -> None:
         try:
             from p4p.nt import NTScalar
             from p4p.server import Server, StaticProvider
@@ -135,19 +223,22 @@ class RunServer:
             raise ConfigError(
                 'EPICS needs the library p4p: pip install "splatline[epics]". Nothing was started.'
             ) from error
-        self._runs, self._say = runs, say
+        self._runs, self._say, self._now = runs, say, now
         self._reader: Reader | None = None
-        self._values, self._lines, self._beats = RunValues(), 0, 0
+        self._values, self._lines, self._beats = StampedValues(RunValues(), now()), 0, 0
         self._busy = threading.Lock()
         provider, self._shown = StaticProvider("splatline"), dict[str, Any]()
         for each in fields(RunValues):
             about = {"display.description": each.metadata["about"], "display.units": each.metadata["unit"]}
             kind = NTScalar(_TYPES[str(each.type)], display=True)
-            self._shown[each.name] = pv = SharedPV(nt=kind, initial={"value": each.default, **about})
+            initial = _posted(each.default, self._values.stamp(each.name))
+            self._shown[each.name] = pv = SharedPV(nt=kind, initial={**initial, **about})
             provider.add(prefix + each.metadata["pv"], pv)
-        self._heartbeat = SharedPV(nt=NTScalar("l"), initial=0)
+        begun = Stamp(now())
+        self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, begun))
         provider.add(prefix + "Heartbeat", self._heartbeat)
-        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=False) for verb in (Verb if control else ())}
+        untold = _posted(False, begun)
+        self._verbs = {verb: SharedPV(nt=NTScalar("?"), initial=untold) for verb in (Verb if control else ())}
         for verb, pv in self._verbs.items():
             pv.put(self._verb(verb))
             provider.add(f"{prefix}{verb.value.capitalize()}Scan", pv)
@@ -162,22 +253,24 @@ class RunServer:
         return dict(self._server.conf())
 
     def look(self) -> None:
-        """Look at the run, and post what has changed."""
+        """Look at the run, and post what has been set since, with the time and the alarm of what set it."""
         now, before = self._read(), self._values
         for each in fields(RunValues):
-            value, known = getattr(now, each.name), getattr(before, each.name)
-            if value != known and (value == value or known == known):  # NaN is not equal to itself
-                self._shown[each.name].post(value)
+            value, stamp = getattr(now.values, each.name), now.stamp(each.name)
+            known = getattr(before.values, each.name)
+            same = value == known or (value != value and known != known)  # NaN is not equal to itself
+            if not same or stamp != before.stamp(each.name):
+                self._shown[each.name].post(_posted(value, stamp))
         self._values = now
         self._beats += 1
-        self._heartbeat.post(self._beats)
+        self._heartbeat.post(_posted(self._beats, Stamp(self._now())))
 
     def close(self) -> None:
         self._server.stop()
         if self._reader is not None:
             self._reader.close()
 
-    def _read(self) -> RunValues:
+    def _read(self) -> StampedValues:
         try:
             run = newest(self._runs)
         except ConfigError:
@@ -187,15 +280,17 @@ class RunServer:
         if self._reader is None or self._reader.what != what:
             if self._reader is not None:
                 self._reader.close()
-            self._reader, self._lines, values = Reader(what), 0, RunValues()
+            self._reader, self._lines = Reader(what), 0
+            values = StampedValues(RunValues(), self._now())
+        seen, why = None, ""
         try:
             seen = self._reader.state()
-        except (DataError, NotReadyError, OSError):
-            return values
+        except (DataError, NotReadyError, OSError) as error:
+            why = user_message(error)
         lines = self._reader.events.lines
-        values = values.after(lines[self._lines :]).with_file(seen)
+        values = values.after(lines[self._lines :])
         self._lines = len(lines)
-        return values
+        return values.unreadable(why) if seen is None else values.with_file(seen, self._now())
 
     def _verb(self, verb: Verb) -> Callable[[Any, Any], None]:
         """A handler of a PV: true sends the verb to the run, and the PV is false again."""
@@ -205,12 +300,29 @@ class RunServer:
                 op.done()
                 return
             self._say(f"{verb} from {op.peer()}")
+            stamp = Stamp(self._now())
             try:
                 with self._busy:
                     tell(newest(self._runs), verb)
             except (BeamlineError, OSError) as error:
-                op.done(error=user_message(error))
+                stamp = replace(stamp, severity=Severity.MAJOR, message=user_message(error))
+                pv.post(_posted(False, stamp))
+                op.done(error=stamp.message)
             else:
+                pv.post(_posted(False, stamp))
                 op.done()
 
         return put
+
+
+def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:
+    """A value with its time and alarm, in the fields of an NTScalar."""
+    seconds = math.floor(stamp.time)
+    return {
+        "value": value,
+        "timeStamp.secondsPastEpoch": seconds,
+        "timeStamp.nanoseconds": min(999_999_999, round(1e9 * (stamp.time - seconds))),
+        "alarm.severity": int(stamp.severity),
+        "alarm.status": _UNDEFINED if stamp.severity is Severity.INVALID else _DEVICE if stamp.severity else 0,
+        "alarm.message": stamp.message,
+    }

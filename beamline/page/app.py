@@ -241,10 +241,10 @@ class _Server:
 
     def model(self, request: Request) -> Response:
         """The live picture: newest view, the volume seen from there, their difference in noise."""
-        folder, picture = self._reader.what.folder, b""
-        if folder is not None:
+        run, picture = self._reader.what.run, b""
+        if run is not None:
             with suppress(OSError):
-                picture = (folder / PICTURE).read_bytes()
+                picture = (run / PICTURE).read_bytes()
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
     def verb(self, request: Request) -> Response:

@@ -21,10 +21,12 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Whole frames in a scan file, and its status: `running`, `complete`, `stopped` or `failed`."""
+    """Whole frames in a scan file, its status (`running`, `complete`, `stopped` or `failed`), and the time of the
+    newest frame, s since the Unix epoch; None without one."""
 
     frames: int
     status: str
+    newest: float | None = None
 
 
 class Recording:
@@ -66,7 +68,11 @@ class Recording:
         ]
         for value in values:
             hdf5.look_again(value)
-        return ScanProgress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
+        n, times = int(committed[()]), self._file[layout.TIME]
+        if n:
+            hdf5.look_again(times)
+        newest = float(times[n - 1]) if n else None
+        return ScanProgress(n, hdf5.text(status[()]) if finished[()] else "running", newest)
 
     def facts(self) -> dict[str, Any]:
         """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""

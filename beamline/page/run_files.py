@@ -12,12 +12,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of
+from beamline.core.files import EVENTS, parts_of, run_of
 from beamline.core.process import json_object
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
+from beamline.scan.runs import DIED
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.interrupted import next_step
+from beamline.storage.writer_lock import QUIET, held
 
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
@@ -35,9 +38,14 @@ class Watched:
         return self.scan.name if self.folder is None else self.folder.resolve().name
 
     @property
+    def run(self) -> Path | None:
+        """The folder of the run, which has the volume of all parts; None: a scan file alone."""
+        return None if self.folder is None else run_of(self.folder.resolve())
+
+    @property
     def volumes(self) -> tuple[Path, ...]:
-        """Paths where a volume of the run may be, the best first."""
-        return () if self.folder is None else (self.folder / RECON, self.folder / SNAPSHOT)
+        """Paths where a volume of the run may be."""
+        return () if self.run is None else (self.run / RECON, self.run / SNAPSHOT)
 
 
 def watched(path: Path) -> Watched:
@@ -105,23 +113,27 @@ class Reader:
         return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
-        """Frames in the file, its status, seconds since the last frame, free bytes, name of the newest volume."""
+        """Frames in the file, its status, what can be done if its scan has died, seconds since the last frame, the
+        time of the newest, free bytes, name of the newest volume."""
         self.events.refresh()
         try:
             progress = self.do(Recording.progress)
-            frames, status = progress.frames, progress.status
+            frames, status, newest_frame = progress.frames, progress.status, progress.newest
         except NotReadyError:
-            frames, status = 0, "preparing"
+            frames, status, newest_frame = 0, "preparing", None
         now = time.time()
         with self._lock:
             if frames != self._seen[0]:
                 self._seen = frames, now
             age = now - self._seen[1]
         volume = newest(self.what.volumes)
+        died = status == "running" and not held(self.what.scan) and now - self.what.scan.stat().st_mtime > QUIET
         return {
             "frames": frames,
-            "status": status,
+            "status": DIED if died else status,
+            "next": next_step(self.what.scan) if died else "",
             "age_s": round(age, 1),
+            "newest": newest_frame,
             "free": shutil.disk_usage(self.what.scan.parent).free,
             "volume": None if volume is None else f"{volume.path.name} {volume.changed_ns}",
             "now": now,

@@ -20,6 +20,7 @@ from beamline.storage.volumes.files import opened_volume, times_of
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 
 BINS = 256
+_PERCENTILES = ((0.5, 99.8), (2, 98), (5, 95))
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,12 @@ class VolumeFile:
 
 
 def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
-    """The first existing one of these files."""
+    """The one of these files that was written last; None where none exists."""
+    found = []
     for path in candidates:
         with suppress(OSError):
-            return VolumeFile(path, path.stat().st_mtime_ns)
-    return None
+            found.append(VolumeFile(path, path.stat().st_mtime_ns))
+    return max(found, key=lambda file: file.changed_ns, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,27 @@ def _fbp_of(path: Path, record: ReconRecord) -> Any:
     if record.fbp is None:
         raise DataError(f"{path} keeps no FBP beside its volume.")
     return record.fbp
+
+
+def grey_windows(values: F32) -> dict[str, tuple[float, float]]:
+    """Ends of grey windows by their names, the first one first: matter, then percentiles of all values.
+
+    The first has the darkest and brightest percentiles, unless little metal would leave all other matter black: its end
+    is lowered until the median of the matter is at a third of it. Matter is what is above the noise of air (5 times the
+    rms of negative values) and above 2 % of the range, in volumes whose air is at 0 (within a tenth of the range).
+    """
+    if values.size == 0:
+        return {"matter": (0.0, 1.0)}
+    levels = [float(level) for level in np.percentile(values, [each for ends in _PERCENTILES for each in ends])]
+    low, high = levels[:2]
+    negative = values[values < 0].astype(np.float64)
+    noise = math.sqrt(float(np.mean(negative**2))) if negative.size else 0.0
+    matter = values[values > max(5 * noise, 0.02 * high)]
+    known = matter.size > 0 and low < 0.1 * (high - low)
+    windows = {"matter": _spread(low, min(high, 3 * float(np.median(matter))) if known else high)}
+    for i, (first, last) in enumerate(_PERCENTILES):
+        windows[f"{first:g} to {last:g} %"] = _spread(*levels[2 * i : 2 * i + 2])
+    return windows
 
 
 def _spread(low: float, high: float) -> tuple[float, float]:
@@ -99,9 +122,8 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, length of a voxel along z, y, x and unit, unit of values, method, views, window of all times."""
-        sample = np.concatenate([self._sample(time) for time in range(len(self._slices))])
-        low, high = np.percentile(sample, (0.5, 99.8)) if sample.size else (0.0, 1.0)
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method, views, windows of all times."""
+        windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
             "name": self._name,
@@ -114,7 +136,8 @@ class ShownVolume:
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,
             "coarse_bin": self._slices[0].bin,
-            "window": _spread(float(low), float(high)),
+            "window": windows["matter"],
+            "windows": windows,
         }
 
     def cut(self, axis: int, index: int, region: TileRegion, time: int = 0) -> VolumeTile:

@@ -21,7 +21,7 @@ from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.treatment import boxes_of, flagged_in_part, treatment_of
-from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
+from beamline.storage.rules.validate import quantity_said, references_present, scan_ended, scan_findings
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.binning import bin_views
@@ -186,7 +186,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     """
     flags = selection.step(Flags)
     judged = judged_flags(source) if flags.judged and source.finished else None
-    findings = [*scan_findings(source), *references_usable(source, selection.step(ReferenceCheck).accepted)]
+    accepted = selection.step(ReferenceCheck).accepted
+    findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, accepted)]
     if flags.used:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     refuse(source, findings)

@@ -17,9 +17,11 @@ from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
+from beamline.storage.writer_lock import held
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 
@@ -154,10 +156,12 @@ def frames_of(
         waited = 0.0 if n > done else waited + POLL
         done = n
         if waited > PATIENCE:
-            raise DataError(
-                f"{source.path} has not grown for {PATIENCE:.0f} s and is not finished: the scan died. Its {n} frames "
-                "were looked at."
-            )
+            if not held(source.path):
+                raise DataError(
+                    f"{source.path} has not grown for {PATIENCE:.0f} s and is not finished; its {n} frames were looked "
+                    f"at. {next_step(source.path)}"
+                )
+            waited = 0.0  # the writer waits: for the operator, the beam, or a long exposure
         follow.sleep(POLL)
 
 

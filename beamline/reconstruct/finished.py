@@ -16,7 +16,7 @@ import recon
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.phases import Phases
-from beamline.core.sinks import Warn, Warnings
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepared import PreparedProjections
@@ -34,6 +34,7 @@ from beamline.reconstruct.remarks import partly_seen_warning
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
+from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
@@ -74,7 +75,7 @@ def reconstruct_file(
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
-        require_finished(source, options, warn)
+        require_finished(source, options)
         facts, options = facts_of(source), options.around_region(source)
         prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
     selection = options.selection
@@ -143,17 +144,14 @@ def reconstruct_file(
     return metrics
 
 
-def require_finished(source: ScanSource, options: ReconOptions, warn: Warn) -> None:
-    """Raises DataError for an unfinished scan; warns where it is to be taken as it is."""
-    if source.finished:
+def require_finished(source: ScanSource, options: ReconOptions) -> None:
+    """Raises DataError for an unfinished scan, unless it is to be taken as it is."""
+    if source.finished or options.unfinished:
         return
-    n = source.image_key.size
-    if not options.unfinished:
-        raise DataError(
-            f"{source.path} is still being written, or its scan died. Follow it with --follow, or take the {n} "
-            "frames that are there with --unfinished."
-        )
-    warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
+    raise DataError(
+        f"{source.path} is not finished. {next_step(source.path)} --unfinished takes the {source.image_key.size} "
+        "frames that are there as they are. Nothing was written."
+    )
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:

@@ -16,6 +16,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.progress import compilation_events
 from beamline.reconstruct.result import write_result
+from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.writer_lock import held
 from drivers.base.clock import Clock
@@ -24,6 +25,7 @@ from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 DEFAULT_SECONDS = 20.0  # of the last round
+_LOOK = 1.0  # s between looks whether the writer still holds its lock
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class FollowTiming:
         poll: between looks at the file while there is nothing to fit.
         slice: of fitting between looks at the file.
         snapshot: between intermediate volumes.
-        patience: without a new frame in an unfinished file, before it is asked whether its writer still runs.
+        patience: without a new frame, before a file without the lock of its writer counts as one that died.
     """
 
     poll: float = 0.1
@@ -139,7 +141,8 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_sto
     Raises:
         DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
     """
-    last_frame = last_snapshot = clock.now()
+    last_frame = last_snapshot = last_look = clock.now()
+    was_locked = locked = held(growing.source.path)
     while True:
         ended = growing.source.finished  # asked before the frames, so that none is missed
         if growing.take_new_frames(ended):
@@ -150,13 +153,17 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_sto
             if not growing.has_volume:
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False
-        if clock.now() - last_frame > rhythm.patience:
-            if held(growing.source.path):  # the writer waits: for the operator, the beam, or a long exposure
-                last_frame = clock.now()
-                continue
+        now = clock.now()
+        if now - last_look >= _LOOK:
+            last_look, was_locked, locked = now, locked, held(growing.source.path)
+        if locked and now - last_frame > rhythm.patience:
+            last_frame = now  # the writer waits: for the operator, the beam, or a long exposure
+        gone = was_locked and not locked and not growing.source.finished  # the lock goes after the end is written
+        if gone or now - last_frame > rhythm.patience:
+            why = "has lost its writer" if gone else f"has not grown for {rhythm.patience:.0f} s"
             raise DataError(
-                f"{growing.source.path} has not grown for {rhythm.patience:.0f} s and is not finished: the scan died. "
-                f"Run without --follow and with --unfinished to use the {growing.n_views} views that are there."
+                f"{growing.source.path} {why} and is not finished. {next_step(growing.source.path)} Without --follow "
+                f"and with --unfinished the {growing.n_views} views that are there are used."
             )
         if not growing.advance(rhythm.slice):
             clock.sleep(rhythm.poll)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing
+from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
 from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from beamline.storage.writers.recon_file import ReconRecord
@@ -21,7 +21,7 @@ _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 
 def report_beside(output: Path) -> Path:
     """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
-    return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
+    return output.with_name(REPORT) if output.stem == "recon" else output.with_suffix(".html")
 
 
 @dataclass(frozen=True)

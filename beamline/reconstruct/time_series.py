@@ -176,7 +176,7 @@ def reconstruct_series(
     options.target.refuse_existing()
     began, warn, phases = clock.now(), Warnings(sink, clock), Phases(sink, clock)
     with options.source.open() as source:
-        require_finished(source, options, warn)
+        require_finished(source, options)
         facts = facts_of(source)
         prepared = prepare_projections(
             source, options.selection, warn,

@@ -27,12 +27,12 @@ from beamline.scan.resume import (
     ResumableRun,
     open_for_resume,
     recover_run,
-    scan_file,
 )
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
 from beamline.scan.runs import describe
 from beamline.scan.states import State
+from beamline.storage.interrupted import scan_file
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
 
@@ -83,7 +83,7 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
 
 def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
     """The scans at these paths, where the folder of a series stands for its scans; see `scans_in`."""
-    return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [path]))
+    return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [scan_file(path)]))
 
 
 def run_energies(

@@ -173,7 +173,7 @@ def _common(config: Config) -> dict[str, object]:
 
 def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> Sequence[str]:
     words = [word for name, value in options.items() for word in (name, str(value))]
-    return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), *flags, "--json", *words]
+    return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), *flags, "--beside-scan", "--json", *words]
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
@@ -188,7 +188,8 @@ class LiveReconstruction:
     """A running reconstruction whose events are passed on, each marked with source="recon".
 
     Its `done` becomes `recon_done` and its `failed` a warning: `done` and `failed` belong to the scan. Its stderr goes
-    to the file `log`. A process that cannot be started is a warning, too.
+    to the file `log`. A process that cannot be started is a warning, too. It ends with this process, also with one that
+    is killed, and then leaves no volume.
 
     Args:
         enough: is told why the views so far are enough, in the thread that reads the output.
@@ -216,7 +217,7 @@ class LiveReconstruction:
         try:
             with log.open("x", encoding="utf-8") as stderr:
                 self._process = ChildProcess(
-                    command, stderr, self._pass_on, on_end=self._say_if_early, behind=low_priority
+                    command, stderr, self._pass_on, tether=True, on_end=self._say_if_early, behind=low_priority
                 )
         except OSError as error:
             message = f"The {what} could not be started ({error}). The scan is not affected."

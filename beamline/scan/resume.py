@@ -43,14 +43,6 @@ _IDENTITY = (  # facts about a device that stay the same from scan to scan and d
 )  # fmt: skip
 
 
-def scan_file(path: str | Path) -> Path:
-    """The scan of a path: the file itself, or for the folder of a run the file with all its parts."""
-    path = Path(path)
-    if not (path / SCAN).is_file():
-        return path
-    return path / JOINED if (path / JOINED).is_file() else path / SCAN
-
-
 @dataclass(frozen=True)
 class ResumableRun:
     """A run that can go on.

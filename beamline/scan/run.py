@@ -23,7 +23,7 @@ from beamline.core.errors import (
     user_message,
 )
 from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
-from beamline.core.files import EVENTS
+from beamline.core.files import EVENTS, REPORT
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.sinks import Announcer, JsonLines
@@ -201,6 +201,11 @@ class _Run:
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
 
+    @property
+    def volume(self) -> Path:
+        """The file of the run's volume: a run has one, also where it was resumed."""
+        return (self.series.run if self.series else self.folder) / RECON
+
     @cached_property
     def states(self) -> StateMachine:
         return StateMachine(self.sink)
@@ -228,10 +233,11 @@ class _Run:
 
     def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         path = self.folder / SCAN
-        command = None if live is None else live(path, self.folder / RECON)
+        command = None if live is None else live(path, self.volume)
         timeline = self.ready.timeline
         planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
         self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
+        self._set_volume_aside()
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
@@ -252,6 +258,21 @@ class _Run:
         if follower is not None:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
 
+    def _set_volume_aside(self) -> None:
+        """Rename volume and report of the views before, in a run that goes on: that of all parts gets their names."""
+        for path in (self.volume, self.volume.with_name(REPORT)):
+            if self.series is None or not path.exists():
+                continue
+            aside = path.with_stem(f"{path.stem}.before-{self.folder.name}")
+            try:
+                path.rename(aside)
+                message = f"{path.name}, of the views before, is {aside.name} now"
+                self.sink(StateEntered(self.states.state, message))
+            except OSError as error:  # Windows, where a viewer holds it open
+                self.sink(
+                    Warned(f"{path} could not be renamed ({error.strerror}): the run gets no volume of all parts.")
+                )
+
     def _prepare_memory(self) -> None:
         """Memory for the frames that may wait for the disk, before the first comes. At most a quarter of the free
         memory, as a live volume takes half."""
@@ -270,7 +291,7 @@ class _Run:
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
         began = time.monotonic()
-        words = command(result.path, self.folder / RECON)
+        words = command(result.path, self.volume)
         recon = reconstruct(words, self.folder / RECON_LOG, self.sink, self.stop)
         return replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
 

@@ -9,9 +9,11 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
+from beamline.core.files import CONFIG as CONFIG
 from beamline.core.files import OURS
+from beamline.core.files import RECON as RECON
+from beamline.core.files import SCAN as SCAN
 
-SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
 STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, before "_"

@@ -19,6 +19,7 @@ from beamline.core.text import printable, size
 from beamline.scan.control import running, state_of
 from beamline.scan.run_folder import CONFIG, CONTROL, SCAN, STAMP
 from beamline.scan.states import State
+from beamline.storage.interrupted import next_step
 
 DIED = "died"  # State of a run whose process has ended without a final event
 
@@ -43,6 +44,7 @@ class Run:
         state: of its newest part, see docs/states.md; `died` if its process ended without a final event.
         bytes: of all files in the folder.
         parts: 1, and one for each time that it was resumed.
+        next_step: what can be done with one that died; "" for others.
     """
 
     folder: Path
@@ -54,6 +56,7 @@ class Run:
     state: str
     bytes: int
     parts: int
+    next_step: str = ""
 
     @property
     def over(self) -> bool:
@@ -98,6 +101,7 @@ def describe(run: Path) -> Run:
         state=state,
         bytes=sum(_sizes(run)),
         parts=len(parts),
+        next_step=next_step(run / SCAN) if state == DIED else "",
     )
 
 

@@ -26,8 +26,8 @@ from beamline.storage.volumes.files import whole_volume
 from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
-from recon.post.enhance import Box, enhanced, enhanced_deviation, inscribed_box, sample_circle
-from recon.post.particles import NECK, Particles, cleaned, measured, parted, volume_deviation
+from recon.post.enhance import Box, enhanced, enhanced_deviation, grey_at, inscribed_box, sample_circle
+from recon.post.particles import NECK, Particles, bodies_outside, cleaned, measured, parted, volume_deviation
 
 _SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
 
@@ -81,6 +81,7 @@ class Segmented:
         clusters: of the enhanced grey values.
         particles: of the labels.
         volume_deviation: of each particle's volume; None where the file has no error bars.
+        outside: bodies as bright as particles, and as large as the smallest, that lie outside the box; not the wall.
     """
 
     box: Box
@@ -90,6 +91,7 @@ class Segmented:
     clusters: Clusters
     particles: Particles
     volume_deviation: NDArray[np.float64] | None = None
+    outside: int = 0
 
 
 def segment(options: SegmentOptions) -> Segmented:
@@ -123,18 +125,22 @@ def segment(options: SegmentOptions) -> Segmented:
 def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     nz, ny, nx = volume.grid.shape
     box: Box = slice(0, nz), slice(0, ny), slice(0, nx)
+    whole, outside = volume.data, 0
     if options.margin is not None:
         box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
         volume = Volume(np.ascontiguousarray(volume.data[box]), volume.grid.part(*box))
     grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
     found = clusters(grey, options.n_clusters, options.seed)
     labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
+    if options.margin is not None:
+        bright = whole > grey_at(volume.data, found.threshold, options.percentiles, options.gamma)
+        outside = bodies_outside(cleaned(bright, options.radius, options.smallest), box)
     particles, bars = measured(labels, volume.grid.spacing, volume.grid.first), None
     deviation = _deviation(options, box)
     if deviation is not None and deviation.shape == volume.data.shape:
         of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
         bars = volume_deviation(labels, grey, of_grey, found.threshold) * np.prod(volume.grid.spacing)
-    return Segmented(box, volume, unit, labels, found, particles, bars)
+    return Segmented(box, volume, unit, labels, found, particles, bars, outside)
 
 
 def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
@@ -216,7 +222,7 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
         "percentile_low": low, "percentile_high": high, "gamma": options.gamma, "sigma": options.sigma,
         "clusters": found.clusters.centres.size, "threshold": found.clusters.threshold, "radius": options.radius,
         "smallest": options.smallest, "neck": options.neck, "seed": options.seed,
-        **found.particles.statistics(), "unit": found.unit,
+        **found.particles.statistics(), "outside": found.outside, "unit": found.unit,
     }  # fmt: skip
 
 

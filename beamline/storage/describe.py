@@ -13,6 +13,7 @@ from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said, source_findings
 from beamline.storage.volumes.files import times_of, volume_format
+from beamline.storage.writer_lock import held
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from drivers.base.frame import FrameKind
 
@@ -60,6 +61,8 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     findings = source_findings(source)
     attributes = dict(source.attributes)
+    if not source.finished and not held(source.path):
+        attributes["status"] = "died"
     facts = {
         "path": str(source.path),
         "format": source.format,

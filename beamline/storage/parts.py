@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of, whole_file
+from beamline.core.files import EVENTS, parts_of, run_of, whole_file
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -118,8 +118,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 def other_parts(part: Path) -> list[Path]:
     """The files of the other parts of its run that may hold frames, joined or not."""
     part = part.resolve()
-    run = part.parent.parent if part.parent in parts_of(part.parent.parent) else part.parent
-    files = (folder / part.name for folder in parts_of(run))
+    files = (folder / part.name for folder in parts_of(run_of(part.parent)))
     return [file for file in files if file != part and may_hold_frames(file)]
 
 

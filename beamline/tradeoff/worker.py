@@ -11,7 +11,6 @@ import json
 import math
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -27,6 +26,7 @@ from scipy import ndimage
 import recon
 from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
+from beamline.core.process import at_end_of
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in, write_array
@@ -250,20 +250,6 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
     return on_progress
 
 
-def end_with(pipe: int) -> None:
-    """End this process when the file descriptor `pipe` does, that is when the process at its other end has ended.
-
-    Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
-    """
-
-    def wait() -> None:
-        while os.read(pipe, 1024):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, name="parent", daemon=True).start()
-
-
 def main(job: Path) -> int:
     """Run the job in the file `job`.
 
@@ -296,5 +282,5 @@ def main(job: Path) -> int:
 
 
 if __name__ == "__main__":
-    end_with(sys.stdin.fileno())
+    at_end_of(sys.stdin.fileno(), lambda: os._exit(1))
     sys.exit(main(Path(sys.argv[1])))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,6 +167,31 @@ class Volume:
     def __repr__(self) -> str:
         size, edge = " x ".join(map(str, self.grid.shape)), self.grid.voxel_size
         return f"Volume({size} voxels [z, y, x] of {edge:.4g})"
+
+    def save(self, path: str | Path, **facts: object) -> None:
+        """Write it to the new file `path`, an .npz; `beamline export` takes it further.
+
+        Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `slice_mm` (the edge along z), `centre_zyx_mm`, and
+        `facts`. Written as a whole or not at all.
+
+        Raises:
+            ValueError: another suffix.
+            FileExistsError: nothing is overwritten.
+        """
+        path, grid = Path(path), self.grid
+        if path.suffix != ".npz":
+            raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")
+        if path.exists():
+            raise FileExistsError(f"{path} exists and is not overwritten; name another file")
+        partial = path.with_name(f".{path.name}.partial.npz")
+        places: dict[str, object] = {
+            "voxel_mm": grid.voxel_size, "slice_mm": grid.spacing[0], "centre_zyx_mm": grid.centre
+        }  # fmt: skip
+        try:
+            np.savez(partial, **{"volume": self.data, **places, **facts})  # type: ignore[arg-type]
+            partial.rename(path)
+        finally:
+            partial.unlink(missing_ok=True)
 
     def _repr_html_(self) -> str:
         """For a notebook: the middle slices across z, y and x."""

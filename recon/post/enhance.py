@@ -100,6 +100,12 @@ def enhanced(
     return ndimage.gaussian_filter(out, sigma) if sigma > 0 else out
 
 
+def grey_at(volume: F32, level: float, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0) -> float:
+    """The value of the volume at a `level` of its grey values, as `enhanced` rescales them."""
+    bottom, top = _range(volume, *percentiles)
+    return bottom + (top - bottom) * float(level ** (1 / gamma))
+
+
 def enhanced_deviation(
     volume: F32, deviation: F32, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0
 ) -> F32:

@@ -60,6 +60,23 @@ def ball(radius: int) -> Mask:
     return squares[:, None, None] + squares[:, None] + squares <= radius**2
 
 
+def bodies_outside(mask: Mask, box: tuple[slice, slice, slice]) -> int:
+    """Connected bodies that no voxel of the box belongs to, without those that surround it in y and x, as a wall does.
+
+    Args:
+        mask: [z, y, x].
+        box: part of the volume.
+    """
+    parts, n = ndimage.label(mask)
+    inside = set(np.unique(parts[box]).tolist())
+    _, y, x = box
+    return sum(
+        number not in inside
+        and not (rows.start < y.start and rows.stop > y.stop and cols.start < x.start and cols.stop > x.stop)
+        for number, (_, rows, cols) in enumerate(ndimage.find_objects(parts, n), 1)
+    )
+
+
 def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
     """Opened, closed, holes filled, and parts of fewer than `smallest` voxels removed.
 

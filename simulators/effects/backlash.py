@@ -26,6 +26,9 @@ class Backlash(PoseEffect):
     sample is `lost_motion_deg` ahead of the stage's angle. For a standing stage its last move decides; without a move
     within an hour, forwards is assumed. The lost motion at the beginning of a move is not simulated: a scan's first
     view comes after it.
+
+    Attributes:
+        lost_motion_deg: degrees by which the sample is ahead while the stage turns backwards.
     """
 
     lost_motion_deg: Positive

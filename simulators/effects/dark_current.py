@@ -22,7 +22,8 @@ class DarkCurrent(ImageEffect):
     A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely. This makes
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
 
-    `rate`: electrons a second and sensor pixel.
+    Attributes:
+        rate: electrons a second and sensor pixel.
     """
 
     rate: NotNegative = DARK_CURRENT

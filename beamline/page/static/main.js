@@ -254,7 +254,8 @@ async function onState(event) {
 }
 
 function header(now) {
-  const word = state || now.status, chip = $("state");
+  const word = now.next ? now.status : state || now.status, chip = $("state");
+  if (now.next) $("said").textContent = now.next;
   chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
   $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
   const shown = { frames: planned ? `${now.frames} stored, ${ledger.exposed || now.frames} exposed, ${planned} planned` : `${now.frames}` };

@@ -202,10 +202,17 @@ async function start() {
   $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.seconds.length ? `${each.seconds.length} times ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
   document.title = volumes.map((each) => each.name).join(", ");
   volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `api/slice/${which}/${axis}/${index}`));
-  const setRange = windowSliders($("window"), (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); });
-  const [low, high] = first.window;
+  const showWindow = (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); };
+  const setRange = windowSliders($("window"), showWindow);
+  const ends = Object.values(first.windows), low = Math.min(...ends.map((each) => each[0])), high = Math.max(...ends.map((each) => each[1]));
+  const range = [low - (high - low), high + (high - low)];
   for (const row of rows) row.window = first.window;
-  setRange([low - (high - low), high + (high - low)], first.window);
+  setRange(range, first.window);
+  for (const [name, window] of Object.entries(first.windows)) {
+    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name, title: "grey window" });
+    button.addEventListener("click", () => { setRange(range, window); showWindow(window); });
+    $("window").append(button);
+  }
   const several = volumes.map((each) => each.seconds).filter((each) => each.length);
   if (second && first.shape.join() === second.shape.join() && several.every((each) => each.length === several[0].length)) {
     $("difference-window").hidden = false;

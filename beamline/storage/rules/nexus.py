@@ -208,21 +208,13 @@ def frames_differ(places: Places) -> Iterator[Finding]:
         )
 
 
-def writer_finished(places: Places) -> Iterator[Finding]:
-    """The writer closed the file, and counted no more rows than there are."""
+def frames_counted(places: Places) -> Iterator[Finding]:
+    """The writer counted no more rows than there are."""
     if layout.COMMITTED not in places.entry.file or places.entry.name != layout.ENTRY:
         return
-    file = places.entry.file
-    committed, n = int(file[layout.COMMITTED][()]), places.data.shape[0]
+    committed, n = int(places.entry.file[layout.COMMITTED][()]), places.data.shape[0]
     if committed > n:
         yield Finding("error", "unfinished", f"{committed} frames are counted as committed, but {n} are there.")
-    if not file[layout.FINISHED][()]:
-        yield Finding(
-            "warning", "unfinished", f"Still being written, or its writer died: {committed} frames can be trusted."
-        )
-    status = hdf5.text(file[layout.STATUS][()])
-    if status in ("stopped", "failed"):
-        yield Finding("warning", "unfinished", f"The scan ended as {status!r} after {committed} frames.")
 
 
 RULES: tuple[Rule, ...] = (
@@ -239,7 +231,7 @@ RULES: tuple[Rule, ...] = (
     time_order,
     framestamp_order,
     frames_differ,
-    writer_finished,
+    frames_counted,
 )
 
 

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, damaged, user_message
+from beamline.core.files import run_of
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError
+from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -85,12 +87,26 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 def source_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan, what is wrong with its references, and what is flagged."""
-    return [*scan_findings(source), *references_usable(source), *frames_flagged(source)]
+    return [
+        *scan_findings(source), *scan_ended(source), *references_usable(source), *frames_flagged(source),
+    ]  # fmt: skip
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
+
+
+def scan_ended(source: ScanSource) -> Iterator[Finding]:
+    """The writer closed the file, and the scan ended as it was planned; else what can be done."""
+    status, n = source.attributes.get("status"), count(source.image_key.size, "frame")
+    if not source.finished:
+        said = f"The file was not closed: {n} can be trusted."
+    elif status in ("stopped", "failed"):
+        said = f"The scan ended as {status!r} after {n}."
+    else:
+        return
+    yield Finding("warning", "unfinished", f"{said} {next_step(source.path)}".strip())
 
 
 def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator[Finding]:
@@ -442,7 +458,9 @@ def parts_joined(source: ScanSource) -> Iterator[Finding]:
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
     elif others := other_parts(source.path):
         said = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
-        yield Finding("warning", "parts", f"{said}: `beamline recover RUN` joins them.")
+        yield Finding(
+            "warning", "parts", f"{said}: `beamline recover {run_of(source.path.resolve().parent)}` joins them."
+        )
 
 
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (

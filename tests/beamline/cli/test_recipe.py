@@ -173,3 +173,14 @@ def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> No
     _same(first, _made(folder, *line))
     rectified = _made(folder, "recon", "scan.h5", *short, *settings, "-o", "x.h5")
     assert not np.array_equal(first.volume.data, rectified.volume.data)
+
+
+def test_with_an_output_the_recipe_is_written_and_the_volume_made(folder: Path) -> None:
+    assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "both.yaml", "-o", "both.h5").exit_code == 0
+    assert (folder / "both.yaml").read_text() == read_reconstruction(folder / "both.h5").parameters["recipe"]
+
+
+def test_an_output_that_exists_leaves_no_recipe(folder: Path) -> None:
+    (folder / "there.h5").touch()
+    assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "none.yaml", "-o", "there.h5").exit_code == 5
+    assert not (folder / "none.yaml").exists()

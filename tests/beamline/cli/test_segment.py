@@ -54,6 +54,8 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
     assert left(here) == {"recon.h5", "recon_particles.h5", "recon_particles.csv", "recon_particles.png"}
     assert (here / "recon_particles.png").read_bytes().startswith(b"\x89PNG")
     assert f"{len(WHOLE)}, 0 of them cut" in result.stdout
+    others = len(BALLS) - len(WHOLE)
+    assert f"left out    {others} bod{'y' if others == 1 else 'ies'} as bright outside the square" in result.stdout
     rows = _rows(here / "recon_particles.csv")
     assert [row["volume_mm3"] for row in rows] == sorted((row["volume_mm3"] for row in rows), reverse=True)
     first = [axis[0] for axis in grid.coordinates()]

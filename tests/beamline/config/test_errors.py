@@ -65,7 +65,7 @@ FAULTS = {
     ),
     "mixed": (
         ('"sim://pm16c"', "COM3"),
-        "my.yaml:1: the configuration: simulated devices cannot see real ones: camera, "
+        "my.yaml:7: devices.stage: simulated devices cannot see real ones: camera, "
         "shutter, sample_mover simulated, stage real",
     ),
     "stage of no kind": (
@@ -82,8 +82,8 @@ FAULTS = {
     ),
     "an output that the PM16C has not": (
         ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),
-        "my.yaml:6: devices: a pm16c stage has no digital output for a shutter; set shutter.kind: manual, or use the "
-        "output of another controller (stage.kind pi_gcs or zaber)",
+        "my.yaml:9: devices: shutter.kind: a pm16c stage has no digital output for a shutter; set it to manual, or use "
+        "the output of another controller (stage.kind pi_gcs or zaber)",
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -145,3 +146,52 @@ def test_a_process_may_stand_behind_all_others(behind: bool) -> None:
     with ChildProcess([sys.executable, "-c", SLEEPS], sys.stderr, lambda line: None, behind=behind) as process:
         nice, ours = psutil.Process(process._process.pid).nice(), psutil.Process().nice()
         assert (nice != ours) == (behind and ours != 19)  # the last of all
+
+
+def _tethered(program: str) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe, stderr=pipe, env=environment)
+
+
+ENDS_AT_ONCE = """
+import os, time
+from beamline.core.process import at_end_of
+at_end_of(0, lambda: os._exit(1))
+print("up", flush=True)
+time.sleep(100)
+"""
+ASKS = """
+import time
+from beamline.core.process import EndsWithParent
+from beamline.core.stop import never_stopped
+with EndsWithParent(never_stopped, 0)() as should_stop:
+    print("up", flush=True)
+    while not should_stop():
+        time.sleep(0.05)
+"""
+NEVER_ASKS = """
+import time
+from beamline.core import process
+from beamline.core.stop import never_stopped
+process._LAST_WORK = 0.2
+scope = process.EndsWithParent(never_stopped, 0)
+print("up", flush=True)
+time.sleep(100)
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "code", "said"),
+    [(ENDS_AT_ONCE, 1, b""), (ASKS, 1, b"KeyboardInterrupt: the process that started"), (NEVER_ASKS, 130, b"")],
+)
+def test_a_process_with_a_tether_ends_when_whoever_wanted_its_result_is_gone(
+    program: str, code: int, said: bytes
+) -> None:
+    with _tethered(program) as process:
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline().strip() == b"up"
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(timeout=60) in (code, -2)  # -2: POSIX tells of an interrupt by its signal
+        assert said in process.stderr.read()

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.epics.ioc import RunServer
+from beamline.epics.ioc import RunServer, RunValues
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 thread = pytest.importorskip("p4p.client.thread")
@@ -67,14 +69,82 @@ def test_a_finished_run_and_the_next_one(tmp_path: Path) -> None:
         assert client.get("T:SampleName") == "second"
 
 
+def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> None:
+    (tmp_path / "2026-01-01T000000_a").mkdir()
+    run = tmp_path / "2026-01-01T000000_a"
+    scan = TwoCylinders()
+    write_flagged(run / "scan.h5", frames_of(scan), {})
+    events = [
+        {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98},
+        {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
+        {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
+    ]
+    (run / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events), encoding="utf-8")
+    begin = time.time()
+    with _served(tmp_path) as (server, client):
+        server.look()
+        time.sleep(0.5)
+        alarm = {
+            name: (value.severity, value.timestamp)
+            for name in (
+                "SampleName", "Alarms", "LastFlag", "ScanStatus", "Message", "ImagesSaved", "Beam", "Heartbeat",
+                "Warnings", "DiskFree",
+            )
+            for value in [client.get(f"T:{name}")]
+        }  # fmt: skip
+        assert client.get("T:ScanStatus").raw.alarm.message == "the stage does not answer"
+    newest = frames_of(scan)[-1].time
+    assert alarm["SampleName"] == (0, 1.7e9) and alarm["Warnings"] == (0, 1.7e9)
+    assert alarm["Alarms"] == alarm["LastFlag"] == (2, 1.7e9 + 1.25)
+    assert alarm["ScanStatus"] == alarm["Message"] == (2, 1.7e9 + 2.5)
+    assert alarm["ImagesSaved"] == (0, pytest.approx(newest, abs=1e-6))
+    assert alarm["Beam"][0] == 3
+    for name in ("Beam", "Heartbeat", "DiskFree"):
+        assert begin <= alarm[name][1] <= time.time()
+
+
+def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path) -> None:
+    begin = time.time()
+    with _served(tmp_path, control=True) as (_, client):
+        named = [each.metadata["pv"] for each in fields(RunValues)]
+        for name in [*named, "Heartbeat", "PauseScan", "ResumeScan", "StopScan", "AbortScan"]:
+            assert begin <= client.get(f"T:{name}").timestamp <= time.time()
+
+
+def test_a_monitor_gets_each_frame_with_its_time(tmp_path: Path) -> None:
+    """Also where the value is the one before."""
+    run = tmp_path / "2026-01-01T000000_a"
+    run.mkdir()
+    write_flagged(run / "scan.h5", frames_of(TwoCylinders()), {})
+    log = run / "events.jsonl"
+    started = {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a", "sample": "s", "n_frames": 98}
+    log.write_text(json.dumps(started) + "\n", encoding="utf-8")
+    seen: list[float] = []
+    with _served(tmp_path) as (server, client):
+        server.look()
+        with closing(client.monitor("T:FrameRate", lambda value: seen.append(value.timestamp))):
+            for second in (1, 2, 3):
+                frame = {
+                    "event": "frame", "time": 1.7e9 + second, "n": second, "frames_per_s": 2.0, "mb_per_s": 1.0,
+                    "eta_s": 5.0, "mean": 1.0,
+                }  # fmt: skip
+                with log.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(frame) + "\n")
+                _until(server, lambda: (1.7e9 + second) in seen)  # noqa: B023 - called at once
+    assert seen[-3:] == [1.7e9 + 1, 1.7e9 + 2, 1.7e9 + 3]
+
+
 def test_without_control_there_is_no_verb(tmp_path: Path) -> None:
     with _served(tmp_path) as (_, client), pytest.raises(TimeoutError):
         client.put("T:AbortScan", True, timeout=1.0)
 
 
 def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
-    with _served(tmp_path, control=True) as (_, client), pytest.raises(thread.RemoteError, match="There is no run"):
-        client.put("T:StopScan", True, timeout=WITHIN)
+    with _served(tmp_path, control=True) as (_, client):
+        with pytest.raises(thread.RemoteError, match="There is no run"):
+            client.put("T:StopScan", True, timeout=WITHIN)
+        after = client.get("T:StopScan")
+        assert (bool(after), after.severity) == (False, 2) and "There is no run" in after.raw.alarm.message
 
 
 def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:

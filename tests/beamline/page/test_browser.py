@@ -115,6 +115,9 @@ def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
         browser.until(partial(drawn_in, "#profile canvas"), "the profile is drawn")
         first.send_keys("\ue00e")  # Page Up
         browser.until(lambda: browser.text("where0") == "6", "the next slice")
+        before = browser.text("window")
+        browser.script("[...document.querySelectorAll('#window button')].at(-1).click()")
+        browser.until(lambda: browser.text("window") != before, "the window of these percentiles")
         assert browser.complaints() == []
 
 

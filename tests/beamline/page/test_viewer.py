@@ -11,7 +11,7 @@ from beamline.cli import view as view_command
 from beamline.core.errors import DataError
 from beamline.page import slices
 from beamline.page.tiles import TileRegion
-from beamline.page.volume import ShownVolume
+from beamline.page.volume import ShownVolume, grey_windows
 from beamline.storage.volumes.base import Pixels, bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.page.served import Served, viewed
@@ -220,3 +220,40 @@ def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
     (tmp_path / "v.h5").write_text("no volume")
     with pytest.raises(DataError):
         ShownVolume(tmp_path / "v.h5")
+
+
+def _sample_of(*parts: tuple[float, float], noise: float = 0.0, n: int = 40_000) -> np.ndarray:
+    """Values of which these shares have these levels, with noise."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate([np.full(round(share * n), level) for share, level in parts])
+    return (values + noise * rng.standard_normal(values.size)).astype(np.float32)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize("metal", [0.005, 0.05, 0.15])
+@pytest.mark.parametrize("times", [10.0, 30.0])
+def test_weak_matter_beside_metal_is_not_black_at_first(metal: float, times: float, noise: float) -> None:
+    values = _sample_of((0.6, 0.0), (0.4 - metal, 1.0), (metal, times), noise=noise)
+    low, high = grey_windows(values)["matter"]
+    assert (1.0 - low) / (high - low) > 0.3
+    wide = grey_windows(values)["0.5 to 99.8 %"]
+    assert (1.0 - wide[0]) / (wide[1] - wide[0]) < 0.13
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_a_sample_of_one_matter_has_its_whole_range(share: float, noise: float, offset: float) -> None:
+    values = _sample_of((1 - share, offset), (share, offset + 1.0), noise=noise)
+    windows = grey_windows(values)
+    assert windows["matter"] == windows["0.5 to 99.8 %"]
+
+
+def test_windows_are_buttons_of_the_page(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", RAMP.astype(np.float32))
+    volume = ShownVolume(tmp_path / "v.npy")
+    facts = volume.facts()
+    volume.close()
+    assert [*facts["windows"]] == ["matter", "0.5 to 99.8 %", "2 to 98 %", "5 to 95 %"]
+    assert facts["window"] == facts["windows"]["matter"]
+    assert all(low < high for low, high in facts["windows"].values())

@@ -274,7 +274,7 @@ SO_FAR = ("recon.snapshot.h5", "recon.live.png")
     ("scan", "said", "left"),
     [
         (_no_scan, "No scan began in .* within 3 s", set()),
-        (_dies, "has not grown for 3 s and is not finished.*12 views", {"scan.h5", *SO_FAR}),
+        (_dies, "has lost its writer and is not finished.*`beamline recover .*12 views", {"scan.h5", *SO_FAR}),
         (_ends_without_views, "0 projections", {"scan.h5"}),
         (_ends_with_one_view, "1 projections", {"scan.h5"}),
         (_has_no_flats, "without flats", {"scan.h5"}),

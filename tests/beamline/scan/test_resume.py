@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -390,3 +391,34 @@ def test_only_a_file_that_is_drawn_from_is_a_part(tmp_path: Path) -> None:
         file.create_virtual_dataset(layout.DATA, virtual)
     assert joined_file_of(first) == (tmp_path / JOINED, 1)
     assert joined_file_of(other) is None and joined_file_of(tmp_path / JOINED) is None
+
+
+def test_the_volume_of_all_parts_is_that_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=8, abort=False)
+    (run / "recon.h5").write_text("of some views")
+    (run / "report.html").write_text("of some views")
+    asked: list[tuple[Path, Path]] = []
+
+    def live(scan: Path, output: Path) -> list[str]:
+        asked.append((scan, output))
+        code = "import sys; open(sys.argv[1], 'x').write('of all views')"
+        return [sys.executable, "-c", code, str(output)]
+
+    _go_on(run, live=live)
+    assert asked == [(run / "part-2" / "scan.h5", run / "recon.h5")]
+    assert (run / "recon.h5").read_text() == "of all views"
+    assert (run / "recon.before-part-2.h5").read_text() == "of some views"
+    assert (run / "report.before-part-2.html").read_text() == "of some views"
+    assert [path.relative_to(run) for path in run.rglob("recon.h5")] == [Path("recon.h5")]
+
+
+def test_the_volume_made_afterwards_is_that_of_the_run_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=8, abort=False)
+    asked: list[tuple[Path, Path]] = []
+
+    def afterwards(scan: Path, output: Path) -> list[str]:
+        asked.append((scan, output))
+        return [sys.executable, "-c", ""]
+
+    _go_on(run, afterwards=afterwards)
+    assert asked == [(run / "joined.h5", run / "recon.h5")]

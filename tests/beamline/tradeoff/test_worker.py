@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -227,17 +224,3 @@ def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys
     assert main(tmp_path / "job.json") == 1
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert last["event"] == "failed" and "no matter" in last["message"]
-
-
-@pytest.mark.slow
-def test_it_ends_when_whoever_wanted_its_result_is_gone() -> None:
-    program = "import time; from beamline.tradeoff.worker import end_with; end_with(0); print('up', flush=True); "
-    command = [sys.executable, "-c", program + "time.sleep(100)"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    pipe = subprocess.PIPE
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment) as process:
-        assert process.stdin is not None and process.stdout is not None
-        assert process.stdout.readline().strip() == b"up"
-        assert process.poll() is None
-        process.stdin.close()
-        assert process.wait(timeout=30) == 1

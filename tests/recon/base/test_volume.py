@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction, reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place
@@ -144,3 +146,18 @@ def test_what_cannot_be_joined_is_told_before_anything_is_placed() -> None:
     views = Geometry.parallel(TURN, (1, 32))
     with pytest.raises(ValueError, match="joined_pixels=2 joins 2 x 2 pixels, and the detector has 1 x 32"):
         reconstruct(np.zeros((48, 1, 32)), views, R2(steps=5, fit=FitSettings(joined_pixels=2)))
+
+
+def test_a_volume_is_saved_with_its_places_and_nothing_is_overwritten(tmp_path: Path) -> None:
+    grid = Grid((2, 3, 4), 0.5, (1.0, 2.0, 3.0), slice_pitch=0.25)
+    volume = Volume(np.arange(24, dtype=np.float32).reshape(grid.shape), grid)
+    volume.save(tmp_path / "v.npz", method="r2")
+    with np.load(tmp_path / "v.npz", allow_pickle=False) as saved:
+        np.testing.assert_array_equal(saved["volume"], volume.data)
+        assert (float(saved["voxel_mm"]), float(saved["slice_mm"]), str(saved["method"])) == (0.5, 0.25, "r2")
+        assert tuple(saved["centre_zyx_mm"]) == grid.centre
+    with pytest.raises(FileExistsError, match="not overwritten"):
+        volume.save(tmp_path / "v.npz")
+    with pytest.raises(ValueError, match="beamline export"):
+        volume.save(tmp_path / "v.tif")
+    assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]

@@ -10,7 +10,7 @@ from skimage.measure import regionprops
 
 from recon.post.clusters import clusters
 from recon.post.enhance import enhanced, inscribed_box
-from recon.post.particles import ball, cleaned, measured, parted, volume_deviation
+from recon.post.particles import ball, bodies_outside, cleaned, measured, parted, volume_deviation
 from tests.recon.post.phantom import BALLS, CIRCLE, SHAPE, can, inside
 
 
@@ -138,3 +138,17 @@ def test_twice_the_deviation_and_half_the_slope_move_a_surface_twice_as_far() ->
     )
     np.testing.assert_allclose(twice, 4 * once, rtol=0.15)
     np.testing.assert_allclose(shallow, 4 * once, rtol=0.15)
+
+
+def test_bodies_outside_a_box_are_counted_without_the_wall_around_it() -> None:
+    mask = np.zeros((8, 60, 60), bool)
+    y, x = np.ogrid[:60, :60]
+    mask[:, np.abs(np.hypot(y - 30, x - 30) - 28) < 1.5] = True  # the wall
+    box = slice(0, 8), slice(18, 43), slice(18, 43)
+    assert bodies_outside(mask, box) == 0
+    for n, (row, col) in enumerate([(10, 30), (30, 10), (50, 30), (30, 50)], 1):
+        mask[2:6, row - 2 : row + 2, col - 2 : col + 2] = True
+        assert bodies_outside(mask, box) == n
+    mask[2:6, 28:32, 28:32] = True  # inside
+    mask[2:6, 16:20, 28:32] = True  # across an edge of the box
+    assert bodies_outside(mask, box) == 4

@@ -1,0 +1,114 @@
+"""Rehearsal: the configuration of a real instrument with the simulated counterpart of each of its devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from beamline.config.devices import (
+    DeviceSection,
+    ElectrometerConfig,
+    NoBeamMonitor,
+    SimulatedOrca,
+    StageOutputShutter,
+)
+from beamline.config.models import Config
+from beamline.config.monochromator import NoMonochromator
+from beamline.config.places import MotorSection, NoFilter
+from beamline.config.section import Section
+from beamline.config.stages import StageSection
+from drivers.orca_quest import SENSOR_SHAPE
+
+_MARK = "_rehearsal"
+_ELECTRONS = 5000  # of a sensor pixel in an exposure without a sample: 70 % of its range
+_LONGEST = 60  # characters of a sample's name before the mark, which ends the run folder's name
+
+
+def rehearsal(config: Config, simulation: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The plain values of the same scan with simulated devices; a simulated configuration as it is.
+
+    All that plan, stage and camera settings say stays. The rotation axis is that of the scene, so it is searched.
+
+    Args:
+        simulation: keys of its section. Unless they say otherwise, the scene is a battery that fits the field, and the
+            clock is virtual, so that it waits for each simulated frame.
+    """
+    data = config.model_dump(mode="json")
+    if config.simulated:
+        return data
+    data["simulation"] = {"clock": "virtual", "scene": _scene(config), **(simulation or {})}
+    data["devices"] = _devices(config.devices)
+    data["sample"]["name"] = f"{config.sample.name[:_LONGEST]}{_MARK}"
+    data["optics"]["axis_col"], data["recon"]["axis"] = None, "auto"
+    return data
+
+
+def _scene(config: Config) -> dict[str, Any]:
+    """A battery with air around it in the region that the camera reads, in a beam of the brightness that fits."""
+    height, width = SENSOR_SHAPE
+    row0, col0, rows, cols = getattr(config.devices.camera, "roi", None) or (0, 0, height, width)
+    pitch = config.optics.pixel_size_um * 1e-3  # mm
+    from_middle = max(abs(row0 - height / 2), abs(row0 + rows - height / 2))
+    return {
+        "phantom": {"kind": "battery", "field_of_view": [cols * pitch, 2 * from_middle * pitch], "n_particles": 150},
+        "beam": {"photons_per_s": _ELECTRONS / config.scan.exposure_s},
+        "axis_offset_px": col0 + cols / 2 - width / 2,
+        "effects": ["photon_noise", "dark_current", "read_noise", "offset"],
+    }
+
+
+def _devices(real: DeviceSection) -> dict[str, Any]:
+    high = real.stage.settings.wiring.active_high
+    shared = {name: getattr(real.camera, name, None) for name in SimulatedOrca.model_fields}
+    camera = {name: value for name, value in shared.items() if value is not None}
+    camera |= {"kind": "simulated_orca", "trigger_polarity": "positive" if high else "negative"}
+    shutter, simple = real.shutter, {"kind": "simulated"}
+    return {
+        "stage": _stage(real.stage),
+        "camera": camera,
+        "shutter": _plain(shutter) if isinstance(shutter, StageOutputShutter) else simple,
+        "sample_mover": _motor(real.sample_mover) if isinstance(real.sample_mover, MotorSection) else simple,
+        "filter": _filter(real),
+        "monochromator": _monochromator(real),
+        "beam_monitor": _beam_monitor(real),
+    }
+
+
+def _plain(section: Section) -> dict[str, Any]:
+    return section.model_dump(mode="json")
+
+
+def _stage(stage: StageSection) -> dict[str, Any]:
+    """Its port is the simulated controller's, and a transcript a file of its own, to be compared with the real one."""
+    values = _plain(stage) | {"port": f"sim://{stage.kind}"}
+    if values.get("transcript"):
+        path = Path(values["transcript"])
+        values["transcript"] = str(path.with_name(f"{path.stem}{_MARK}{path.suffix}"))
+    return values
+
+
+def _motor(motor: MotorSection) -> dict[str, Any]:
+    return _plain(motor) | {"stage": _stage(motor.stage)}
+
+
+def _filter(real: DeviceSection) -> dict[str, Any]:
+    if isinstance(real.filter, NoFilter):
+        return _plain(real.filter)
+    if isinstance(real.filter, MotorSection):
+        return _motor(real.filter)
+    return {"kind": "simulated", "places": list(real.filter.places)}
+
+
+def _monochromator(real: DeviceSection) -> dict[str, Any]:
+    found = real.monochromator
+    if isinstance(found, NoMonochromator):
+        return _plain(found)
+    settle = getattr(found, "settle_s", None)
+    return {"kind": "simulated", "range_kev": found.range_kev} | ({} if settle is None else {"settle_s": settle})
+
+
+def _beam_monitor(real: DeviceSection) -> dict[str, Any]:
+    """The simulated electrometer shows a steady current, which says nothing of the limits of the real one."""
+    if not isinstance(real.beam_monitor, ElectrometerConfig):
+        return _plain(NoBeamMonitor())
+    return _plain(real.beam_monitor) | {"port": "sim://electrometer", "pause_below": None, "resume_above": None}

@@ -1,0 +1,95 @@
+"""Runs that were interrupted: the scan and the volume of a run, and what can be done with one that ended early.
+
+Every command that meets such a run says the same, by `next_step`.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from beamline.core.errors import DataError
+from beamline.core.files import CONFIG, EVENTS, RECON, SCAN, parts_of, run_of
+from beamline.storage import hdf5
+from beamline.storage.parts import JOINED, may_hold_frames, views_in, views_planned
+from beamline.storage.superblock import superblock
+from beamline.storage.writer_lock import QUIET, held
+
+
+def scan_file(path: str | Path) -> Path:
+    """The scan of a path: the file itself, or for the folder of a run the file with all its parts.
+
+    Raises:
+        DataError: a run without a scan file, one whose parts are not joined, or a folder of runs.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return path
+    if not (path / SCAN).is_file():
+        return _no_run(path, SCAN)
+    if (path / JOINED).is_file():
+        return path / JOINED
+    parts = [part / SCAN for part in parts_of(path) if may_hold_frames(part / SCAN)]
+    if len(parts) > 1:
+        raise DataError(f"{path} has {len(parts)} parts that are not joined. {next_step(parts[-1])}")
+    return path / SCAN
+
+
+def volume_file(path: Path) -> Path:
+    """The volume of a path: the file or folder itself, or for the folder of a run its recon.h5.
+
+    Raises:
+        DataError: a run without a volume, or a folder of runs.
+    """
+    if (path / RECON).is_file():
+        return path / RECON
+    if not (path / SCAN).is_file():
+        return _no_run(path, RECON) if path.is_dir() else path
+    scan = scan_file(path)
+    make = f"`beamline recon {scan} -o {path / RECON}` makes one."
+    raise DataError(f"{path} has no volume ({RECON}). {next_step(parts_of(path)[-1] / SCAN) or make}")
+
+
+def _no_run(folder: Path, wanted: str) -> Path:
+    """The folder, which may be of another kind, such as of slices. DataError: it is of a run, or of runs."""
+    if (folder / EVENTS).is_file():
+        raise DataError(f"{folder} is the folder of a run without a {wanted}: it ended before its first frame.")
+    if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
+        raise DataError(f"{folder} is a folder of runs: name one of them, such as {runs[-1]}.")
+    return folder
+
+
+def next_step(scan: Path) -> str:
+    """What can be done with a scan whose program still runs, has died, or ended early; "" where nothing is missing."""
+    run = run_of(scan.parent) if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file() else None
+    if run is not None:
+        parts = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]
+        scan = parts[-1] if parts else scan
+    head = superblock(scan) if scan.is_file() else None
+    resume = f"`beamline scan --resume {run}` takes what is missing"
+    if head is None or not head.open_for_writing:
+        return f"It ended early: {resume}." if run is not None and head and _lacks_views(run) else ""
+    if held(scan):
+        watch = "" if run is None else f"`beamline watch {run}` shows it, "
+        return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
+    age = time.time() - scan.stat().st_mtime
+    died = "Its scan has died"
+    if age < QUIET:  # where the disk has no locks, its program may run
+        died += f", unless the program that wrote to it {age:.0f} s ago still runs"
+    what = scan if run is None else run
+    recover = f"`beamline recover {what}` makes an ordinary file of the frames that are there"
+    return f"{died}: {recover if run is None else f'{resume}, {recover}'}."
+
+
+def _lacks_views(run: Path) -> bool:
+    """Whether the files of a run, all closed, lack views of its plan."""
+    planned, views = 0, set[int]()
+    try:
+        for part in parts_of(run):
+            if may_hold_frames(part / SCAN):
+                with hdf5.open_hdf5(part / SCAN) as file, hdf5.readable(part / SCAN):
+                    planned = views_planned(file) or 0
+                    views |= views_in(file)
+    except (DataError, *hdf5.ALTERED):
+        return False
+    return len(views) < planned

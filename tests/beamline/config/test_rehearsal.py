@@ -1,0 +1,193 @@
+"""A real configuration runs as it is with simulated devices, whatever its devices are; faults name their line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from beamline.config.load import Config, config_folder, load
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event
+from beamline.scan.preflight import dry_run
+from beamline.scan.run import run_scan
+from beamline.storage.readers.open import open_scan
+from drivers.base.frame import FrameKind
+from drivers.stages.registry import STAGES
+
+INSTRUMENT = config_folder() / "instrument.yaml"
+LIMITS = "counts_per_turn: 360000, max_speed_deg_s: 10, acceleration_deg_s2: 20, low_deg: -5, high_deg: 365"
+STAGE = {
+    "pm16c": "{kind: pm16c, port: COM3, %s}",
+    "pi_gcs": '{kind: pi_gcs, port: COM3, axis: "1", %s}',
+    "zaber": "{kind: zaber, port: COM3, device: 1, axis: 1, %s}",
+    "epics": '{kind: epics, port: "ca://2bma:m49", %s}',
+}
+DEVICES = {
+    "as shipped": (),
+    "shutter behind EPICS": (
+        "devices.shutter={kind: epics, open_pv: 'ca://S:OPEN', close_pv: 'ca://S:CLOSE', status_pv: 'ca://S:BEAM'}",
+    ),
+    "shutter on an output": (
+        f"devices.stage={STAGE['pi_gcs'] % LIMITS}", "devices.shutter={kind: stage_output, output: 2}",
+    ),
+    "sample moved by a motor": (
+        "devices.sample_mover={kind: stage, in_deg: 0, out_deg: 20, stage: "
+        f"{STAGE['epics'] % LIMITS}}}",
+    ),
+    "filters by hand": ("devices.filter={kind: manual, places: [none, Al 1 mm]}", "scan.filter=Al 1 mm"),
+    "filters behind EPICS": (
+        "devices.filter={kind: epics, pv: 'ca://F', places: {none: 0, Al 1 mm: 1}}", "scan.filter=Al 1 mm",
+    ),
+    "filters on a motor": (
+        f"devices.filter={{kind: stage, places: {{none: 0, Al 1 mm: 90}}, stage: {STAGE['zaber'] % LIMITS}}}",
+        "scan.filter=none",
+    ),
+    "monochromator by hand": ("devices.monochromator={kind: manual, range_kev: [4, 40]}", "scan.energy=30"),
+    "monochromator behind EPICS": (
+        "devices.monochromator={kind: epics, pv: 'ca://E.VAL', status_pv: 'ca://E.RBV', unit: eV}", "scan.energy=20",
+    ),
+    "electrometer that pauses": (
+        "devices.beam_monitor={kind: electrometer, port: COM4, pause_below: 1.0e+3, resume_above: 2.0e+3}",
+    ),
+    "ring current": ("devices.beam_monitor={kind: ring_current, url: 'http://ring/', pattern: '([0-9.]+) mA'}",),
+    "inverted pulses": (
+        f"devices.stage={STAGE['zaber'] % LIMITS}", "devices.stage.active_high=false",
+        "devices.camera.trigger_polarity=negative",
+    ),
+    "an axis that was measured": ("optics.axis_col=900", "recon.axis=901.5"),
+}  # fmt: skip
+SMALL = (
+    "scan.mode=step", "scan.angles={scheme: fixed, views: 4}", "scan.darks.count=1", "scan.flats.count=1",
+    "recon.live=false", "devices.camera.roi=[1100,1900,32,64]",
+)  # fmt: skip
+
+
+def _rehearsed(*overrides: str) -> Config:
+    return load(INSTRUMENT, overrides, environment={}, rehearse=True)
+
+
+@pytest.mark.parametrize("overrides", DEVICES.values(), ids=DEVICES.keys())
+def test_every_device_has_a_simulated_counterpart(tmp_path: Path, overrides: tuple[str, ...]) -> None:
+    real, found = load(INSTRUMENT, overrides, environment={}), _rehearsed(*overrides)
+    assert not real.simulated and all(found.devices.simulated_or_not().values())
+    assert found.scan == real.scan
+    assert found.devices.stage.settings.figures == real.devices.stage.settings.figures
+    for key in ("roi", "binning", "readout", "model"):
+        assert getattr(found.devices.camera, key) == getattr(real.devices.camera, key)
+    planned, wanted = (dry_run(each, tmp_path).timeline for each in (found, real))
+    assert (planned.n_frames, planned.duration) == (wanted.n_frames, wanted.duration)
+
+
+@pytest.mark.parametrize("kind", STAGES)
+def test_every_stage_has_a_simulated_counterpart(kind: str) -> None:
+    if kind not in STAGE:
+        pytest.skip("of another package")
+    found = _rehearsed(f"devices.stage={STAGE[kind] % LIMITS}", "scan.mode=step")
+    assert found.devices.stage.port == f"sim://{kind}"
+
+
+@pytest.mark.parametrize("name", ["as shipped", "sample moved by a motor", "filters behind EPICS", "inverted pulses"])
+def test_the_scan_runs_to_its_end(tmp_path: Path, name: str) -> None:
+    events: list[Event] = []
+    result = run_scan(_rehearsed(*SMALL, *DEVICES[name]), tmp_path, [events.append])
+    assert result.n_frames == 7 and not result.missing
+    with open_scan(result.path) as source:
+        assert int((source.image_key == FrameKind.PROJECTION).sum()) == 4
+        views = [frame.counts for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
+        flat = next(frame.counts for frame in source.frames() if frame.kind is FrameKind.FLAT)
+    assert all((view.mean() < 0.9 * flat.mean()) and view.mean() > 0.02 * flat.mean() for view in views)
+    assert result.path.parent.name.endswith("battery_rehearsal")
+    again = load(result.path.parent / "config.resolved.yaml", environment={})
+    assert again.simulated  # --resume goes on with simulated devices
+
+
+def test_a_transcript_is_a_file_of_its_own(tmp_path: Path) -> None:
+    found = _rehearsed(f"devices.stage.transcript={tmp_path / 'stage.txt'}")
+    assert found.devices.stage.transcript == str(tmp_path / "stage_rehearsal.txt")  # type: ignore[attr-defined]
+
+
+def test_a_simulated_configuration_stays_as_it_is() -> None:
+    path = config_folder() / "simulated.yaml"
+    assert load(path, environment={}, rehearse=True) == load(path, environment={})
+
+
+def test_what_simulation_is_asked_for_goes_before() -> None:
+    found = _rehearsed("simulation.clock=real", "simulation.seed=7")
+    assert found.simulation is not None
+    assert (found.simulation.clock, found.simulation.seed) == ("real", 7)
+    assert isinstance(found.simulation.scene, dict)
+
+
+def test_a_fault_of_the_real_configuration_is_told_first() -> None:
+    with pytest.raises(ConfigError, match=r"devices\.camera\.ring_mb is 0"):
+        _rehearsed("devices.camera.ring_mb=0")
+
+
+def _edited(path: Path, **changes: Any) -> Path:
+    """instrument.yaml with text replaced, line by line."""
+    text = INSTRUMENT.read_text("utf-8")
+    for old, new in changes.values():
+        assert old in text
+        text = text.replace(old, new, 1)
+    path.write_text(text, "utf-8")
+    return path
+
+
+SIMULATED = {
+    "stage": ("port: /dev/ttyUSB0 ", "port: sim://pm16c "),
+    "camera": ("kind: dcam ", "kind: simulated_orca "),
+    "shutter": ("shutter: {kind: manual}", "shutter: {kind: simulated}"),
+    "mover": ("sample_mover: {kind: manual}", "sample_mover: {kind: simulated}"),
+}
+
+
+def _line(path: Path, text: str) -> int:
+    return next(n for n, line in enumerate(path.read_text("utf-8").splitlines(), 1) if line.strip().startswith(text))
+
+
+def test_keys_of_a_real_camera_are_one_fault_that_names_the_way(tmp_path: Path) -> None:
+    path = _edited(tmp_path / "my.yaml", **SIMULATED)
+    with pytest.raises(ConfigError) as refused:
+        load(path, environment={})
+    said = str(refused.value)
+    assert said.startswith(f"{path}:{_line(path, 'library:')}: devices.camera: library, index, link, ")
+    assert "belong to a real device" in said and "--rehearse" in said and "\n" not in said
+
+
+def test_a_key_that_no_camera_has_is_still_unknown(tmp_path: Path) -> None:
+    path = _edited(tmp_path / "my.yaml", **SIMULATED, more=("cool_s: 0 ", "colour_s: 0 "))
+    with pytest.raises(ConfigError, match=f"my.yaml:{_line(path, 'colour_s')}: devices.camera.colour_s is not a known"):
+        load(path, environment={})
+
+
+@pytest.mark.parametrize(("left", "key"), [("stage", "stage:"), ("shutter", "shutter:"), ("mover", "sample_mover:")])
+def test_a_real_device_among_simulated_ones_is_named_with_its_line(tmp_path: Path, left: str, key: str) -> None:
+    path = _edited(tmp_path / "my.yaml", **{name: change for name, change in SIMULATED.items() if name != left})
+    tree = yaml.safe_load(path.read_text("utf-8"))
+    simulated = ("kind", "model", "roi", "binning", "readout", "trigger_polarity")
+    for name in set(tree["devices"]["camera"]) - set(simulated):
+        text = path.read_text("utf-8").splitlines(keepends=True)
+        path.write_text("".join(line for line in text if not line.strip().startswith(f"{name}:")), "utf-8")
+    with pytest.raises(ConfigError, match="simulated devices cannot see real ones") as refused:
+        load(path, environment={})
+    assert str(refused.value).startswith(f"{path}:{_line(path, key)}: ")
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("scan.filter=Cu", "--set scan.filter=Cu"),
+        ("scan.energy=8.3", "--set scan.energy=8.3"),
+        ("devices.stage.low_deg=400", "--set devices.stage.low_deg=400"),
+        ("recon.stop_when={psnr_loss: null}", "--set recon.stop_when={psnr_loss: null}"),
+        ("devices.camera.binning=true", "--set devices.camera.binning=true"),
+        ("simulation={}", "--set simulation={}"),
+    ],
+)
+def test_a_fault_between_keys_names_the_key_that_is_to_be_looked_at(override: str, line: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load(INSTRUMENT, [override], environment={})
+    assert str(refused.value).startswith(f"{line}: ")
