@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
@@ -80,6 +80,7 @@ def judge(
     at_work.warn(needles_warning(made, prepared.geometry))
     at_work.look_for_odd_views()
     compared = at_work.compare_with_fbp()
+    at_work.compare_regions()
     hiding = "" if left is None else hiding_warning(made, left)
     doubtful = at_work.look_for_lost_mass() or bool(hiding)
     keeps_fbp = doubtful and compared and not in_parts and target.takes_a_second(made.volume.grid)
@@ -111,7 +112,6 @@ class _Judging:
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    mask: NDArray[np.int8] | None = None
     all_rays: float = 0.0  # seconds to project all views, about
 
     def __post_init__(self) -> None:
@@ -140,7 +140,7 @@ class _Judging:
         """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
         grid, geometry = self.made.volume.grid, self.prepared.geometry
         is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
-        found = measure(volume, None if is_part else self.prepared, self.truth, self.mask, self.context.phases.progress)
+        found = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
         return {**found, "seconds": seconds}
 
     def look_at_residual(self) -> Unexplained | None:
@@ -148,7 +148,6 @@ class _Judging:
         made, prepared, seed = self.made, self.prepared, self.context.seed
         views, rng = prepared.projections.data, np.random.default_rng(seed)
         left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
-        self.mask = regions(self.truth or made.volume, seed)  # after the work that takes most memory
         before = self.clock.now()
         own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
@@ -194,6 +193,19 @@ class _Judging:
         self.volumes = {BASELINE: fbp, **self.volumes}
         self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}
         return True
+
+    def compare_regions(self) -> None:
+        """SNR and CNR of all volumes by the regions of one: the truth, else FBP of the views, else none of them.
+
+        Regions of the volume itself would give each method others.
+        """
+        reference = self.truth or self.volumes.get(BASELINE)
+        if reference is None and self.direct:
+            reference = self.made.volume
+        if reference is not None:
+            mask = regions(reference, self.context.seed)
+            for name, volume in self.volumes.items():
+                self.metrics[name] |= contrast_by(mask, volume)
 
     def look_for_lost_mass(self) -> bool:
         """Compare the level of air and weak matter with those of FBP; whether matter was lost."""

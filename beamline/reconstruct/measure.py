@@ -83,15 +83,19 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a good volume (k-means), to judge others of the same sample; None without contrast.
+    """Dense and empty regions of a reference, less their rims, to judge volumes of the same sample; None without them.
 
     They are those of `metrics.sampled` of the volume.
     """
-    try:
-        found = metrics.kmeans_mask(metrics.sampled(volume.data), seed)
-    except ValueError:
-        return None
-    return found if all(any((part == kind).any() for part in found) for kind in (0, 1)) else None
+    return metrics.interior_regions(metrics.sampled(volume.data), seed)
+
+
+def contrast_by(mask: NDArray[np.int8] | None, volume: Volume) -> dict[str, float]:
+    """SNR and CNR of a volume by `regions`; empty without them."""
+    if mask is None:
+        return {}
+    snr, cnr = metrics.snr_cnr(metrics.sampled(volume.data), mask)
+    return {"snr": snr, "cnr": cnr}
 
 
 def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.float32], Geometry] | None) -> float:
@@ -106,15 +110,13 @@ def measure(
     volume: Volume,
     prepared: PreparedProjections | None,
     truth: Volume | None,
-    mask: NDArray[np.int8] | None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
-    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With a mask of the dense and empty
-    regions: SNR and CNR. With views: the residual in up to 16 of the views used, and in the views held out where there
-    are any. Of a detector with more than 2^17 pixels only bands of rows with so many pixels are used. `progress` hears
-    how many of these views were compared.
+    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With views: the residual in up to 16 of
+    the views used, and in the views held out where there are any. Of a detector with more than 2^17 pixels only bands
+    of rows with so many pixels are used. `progress` hears how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:
@@ -123,8 +125,6 @@ def measure(
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
         if prepared is not None and prepared.emission is not None:
             values |= metrics.contrast(truth.data, volume.data)
-    if mask is not None:
-        values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
     if prepared is None:
         return {name: float(value) for name, value in values.items()}
     n = prepared.geometry.n_views

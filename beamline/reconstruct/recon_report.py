@@ -91,9 +91,14 @@ def _footnotes(
     """What the figures of merit mean, as far as there are any."""
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
-        f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
-        "smoother volume has more of both, though it may show less: look for cracks and pores in the pictures.",
     ]
+    if any("cnr" in values for values in metrics.values()):
+        footnotes.append(
+            "SNR, CNR: between the dense and the empty part (k-means of two classes) of "
+            f"{'the truth' if truth else 'FBP of these views'}, without voxels near the other part; the same of all "
+            "volumes. A smoother volume has more of both, though it may show less: look for cracks and pores in the "
+            "pictures."
+        )
     if any("air" in values for values in metrics.values()):
         footnotes.append(
             "Level of air: the mean where FBP has no matter, over the deviation of FBP there (blocks of voxels). "
