@@ -26,7 +26,7 @@ from recon.assess.lost_mass import compare
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.stray_mass import stray_mass, stray_mass_share
+from recon.voxels.stray_mass import StrayMass, stray_mass, stray_mass_share
 from recon.voxels.unexplained import Unexplained, unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
@@ -81,6 +81,7 @@ def judge(
     at_work.look_for_odd_views()
     compared = at_work.compare_with_fbp()
     at_work.compare_regions()
+    at_work.compare_air()
     hiding = "" if left is None else hiding_warning(made, left)
     doubtful = at_work.look_for_lost_mass() or bool(hiding)
     keeps_fbp = doubtful and compared and not in_parts and target.takes_a_second(made.volume.grid)
@@ -112,6 +113,7 @@ class _Judging:
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    stray: StrayMass | None = None
     all_rays: float = 0.0  # seconds to project all views, about
 
     def __post_init__(self) -> None:
@@ -166,6 +168,7 @@ class _Judging:
         stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
         if stray is None:
             return None
+        self.stray = stray
         self.metrics[made.method]["stray"] = stray.share
         self.warn(stray_mass_warning(made, stray))
         return stray.map if stray.share > 0 else None
@@ -207,17 +210,25 @@ class _Judging:
             for name, volume in self.volumes.items():
                 self.metrics[name] |= contrast_by(mask, volume)
 
+    def compare_air(self) -> None:
+        """The level of air of each volume, where the views show it, over the noise of FBP there."""
+        if self.stray is None or BASELINE not in self.volumes:
+            return
+        _, noise = self.stray.level(self.volumes[BASELINE])
+        if noise > 0:  # neither NaN
+            for name, volume in self.volumes.items():
+                self.metrics[name]["air"] = self.stray.level(volume)[0] / noise
+
     def look_for_lost_mass(self) -> bool:
-        """Compare the level of air and weak matter with those of FBP; whether matter was lost."""
+        """Compare weak matter with that of FBP; whether some was lost."""
         lost = False
         if BASELINE not in self.volumes:
             return lost
         fbp = self.volumes[BASELINE]
-        for name, volume in self.volumes.items():
+        for volume in self.volumes.values():
             beside_fbp = compare(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
             if beside_fbp is None:
                 break  # it shows no air
-            self.metrics[name]["air"] = beside_fbp.air
             self.warn(said := lost_mass_warning(self.made, beside_fbp))
             lost = lost or bool(said)
         return lost

@@ -101,8 +101,8 @@ def _footnotes(
         )
     if any("air" in values for values in metrics.values()):
         footnotes.append(
-            "Level of air: the mean where FBP has no matter, over the deviation of FBP there (blocks of voxels). "
-            "Air of FBP that is below zero is missing from the other volume's weak matter."
+            "Level of air: the mean of the voxels that views show to be empty, within the field of all views, over the "
+            "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter."
         )
     if made.grew:
         footnotes.append(
