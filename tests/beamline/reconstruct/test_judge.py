@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from beamline.cli.terminal import results
 from beamline.core.events import Event, VolumeDone
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
@@ -59,3 +61,15 @@ def test_a_better_axis_gives_no_worse_contrast(scan: Path, tmp_path: Path) -> No
         good, off = (figures(scan, tmp_path, method, axis).metrics for axis in (23.5, 25.0))
         assert good["residual"] < off["residual"]
         assert good["snr"] > off["snr"] - 0.3 and good["cnr"] > off["cnr"] - 0.3
+
+
+def test_the_page_has_the_time_of_the_fit_and_of_the_whole_command(scan: Path, tmp_path: Path) -> None:
+    done = figures(scan, tmp_path, "cgls", 23.5)
+    text = re.sub(r"<[^>]*>|\s+", " ", (tmp_path / "cgls_23.5.html").read_text(encoding="utf-8"))
+    assert done.report is not None and done.metrics["seconds"] < done.elapsed
+    own, whole = (re.search(rf"{label}[^\d]*([\d.]+) s", text) for label in ("Time of reconstruction", "whole command"))
+    assert own is not None and whole is not None
+    seconds = float(whole[1])
+    assert done.metrics["seconds"] < seconds < done.elapsed + 0.1
+    assert f"{done.metrics['seconds']:.1f} s ({seconds:.1f} s of the whole command)" in text
+    assert f"{done.elapsed:.1f} s" in results(done)
