@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share
+from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
     hiding_warning,
     lost_mass_warning,
     needles_warning,
+    not_begun_warning,
     odd_views_warning,
     stray_mass_warning,
 )
@@ -154,6 +155,8 @@ class _Judging:
         own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
         self.all_rays = (self.clock.now() - before) / share
+        if not self.direct and "residual" in own:
+            self.warn(not_begun_warning(made, own["residual"], uniform_residual(made.volume.grid, prepared)))
         if left is not None:
             own["unexplained"] = left.share
             self.warn(hiding_warning(made, left))
