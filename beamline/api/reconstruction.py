@@ -39,7 +39,7 @@ class ReconResult:
 
     Attributes:
         method: its name; of a choice, that of the method chosen.
-        figures: figures of merit by name (residual, snr, seconds, ...), see docs/tradeoff.md.
+        figures: figures of merit by name (residual, seconds, ...), see docs/tradeoff.md.
         settings: everything that the volume depends on, by name.
         axis_col: rotation axis in columns of the full detector.
         units: of the volume, 1/mm, or 1/px if the pixel size is unknown; of an emission counts/mm.

@@ -234,7 +234,9 @@ def results(done: VolumeDone) -> str:
     lines.append(f"{'axis_col':<10}{done.axis_col:.2f}")
     lines += [f"{'chosen':<10}{done.chosen}"] if done.chosen else []
     lines += [f"{'next dB':<10}{done.next_db_said}"] if done.next_db_said else []
-    columns = {done.method: done.metrics} | ({} if done.fbp is None else {BASELINE: done.fbp})
+    columns = {done.method: {**done.metrics, "elapsed": done.elapsed}} | (
+        {} if done.fbp is None else {BASELINE: done.fbp}
+    )
     lines.append("")
     lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
     for name, metric in METRICS.items():

@@ -192,7 +192,7 @@ def xafs(
         raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
     if without := [result for result in results if not result.edge.found]:
         where = "" if len(jobs) == 1 else f" in {without[0].title}"
-        why = without[0].edge.reason
+        why = "; ".join(part for part in (without[0].edge.reason, without[0].tabulated) if part)
         raise QualityError(f"No absorption edge was found{where}: {why}. Picture and table were written.")
 
 
@@ -246,7 +246,8 @@ def _result(title: str, run: SeriesResult) -> XafsResult:
         raise DataError(
             f"{title}: {n} energies are too few for an edge, which takes {LEAST}; nothing was written.{why}"
         )
-    return XafsResult(title, run.curve, find_edge(run.curve.energies, run.curve.absorption))
+    edge = find_edge(run.curve.energies, run.curve.absorption)
+    return XafsResult(title, run.curve, edge, run.material, run.elements)
 
 
 def _refuse_given(names: Sequence[str], what: str) -> None:

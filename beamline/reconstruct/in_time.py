@@ -17,7 +17,7 @@ from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.method import BoundedMethod
 from recon.base.volume import Grid
-from recon.methods import with_settings
+from recon.methods import by_name, with_settings
 from recon.splatting.in_time import first_sweep_seconds
 from recon.splatting.initialise import sweeps_of_start
 
@@ -73,13 +73,18 @@ def fit_within(
     measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
     left, least = method.seconds - spent - measuring - after, _LEAST * sweep
     if left < least:
-        start = sweeps_of_start(geometry, getattr(method, "start", "fbp")) * sweep
-        warn(
+        said = (
             f"{duration_text(method.seconds)} do not suffice for this scan: reading and correcting it took "
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "
-            f"{duration_text(measuring + after)}, the start of a fit of all pixels {duration_text(start)}. With a "
-            f"start from coarse pixels the end is in about {duration_text(least + measuring + after)}."
+            f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method"
         )
+        if (kind := getattr(method, "start", None)) is not None:
+            start = sweeps_of_start(geometry, kind) * sweep
+            said += (
+                f". The start of a fit of all pixels takes {duration_text(start)}. With a start from coarse pixels the "
+                f"end is in about {duration_text(least + measuring + after)}"
+            )
+        warn(f"{said}.")
     deadline = Deadline(started[0] + method.seconds, after, clock.now)
     return with_settings(method, {"seconds": max(left, 0.0)}), deadline
 

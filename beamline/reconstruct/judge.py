@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
     hiding_warning,
     lost_mass_warning,
     needles_warning,
+    not_begun_warning,
     odd_views_warning,
     stray_mass_warning,
 )
@@ -26,7 +27,7 @@ from recon.assess.lost_mass import compare
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.stray_mass import stray_mass, stray_mass_share
+from recon.voxels.stray_mass import StrayMass, stray_mass, stray_mass_share
 from recon.voxels.unexplained import Unexplained, unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
@@ -80,6 +81,8 @@ def judge(
     at_work.warn(needles_warning(made, prepared.geometry))
     at_work.look_for_odd_views()
     compared = at_work.compare_with_fbp()
+    at_work.compare_regions()
+    at_work.compare_air()
     hiding = "" if left is None else hiding_warning(made, left)
     doubtful = at_work.look_for_lost_mass() or bool(hiding)
     keeps_fbp = doubtful and compared and not in_parts and target.takes_a_second(made.volume.grid)
@@ -111,7 +114,7 @@ class _Judging:
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    mask: NDArray[np.int8] | None = None
+    stray: StrayMass | None = None
     all_rays: float = 0.0  # seconds to project all views, about
 
     def __post_init__(self) -> None:
@@ -140,7 +143,7 @@ class _Judging:
         """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
         grid, geometry = self.made.volume.grid, self.prepared.geometry
         is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
-        found = measure(volume, None if is_part else self.prepared, self.truth, self.mask, self.context.phases.progress)
+        found = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
         return {**found, "seconds": seconds}
 
     def look_at_residual(self) -> Unexplained | None:
@@ -148,11 +151,12 @@ class _Judging:
         made, prepared, seed = self.made, self.prepared, self.context.seed
         views, rng = prepared.projections.data, np.random.default_rng(seed)
         left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
-        self.mask = regions(self.truth or made.volume, seed)  # after the work that takes most memory
         before = self.clock.now()
         own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
         self.all_rays = (self.clock.now() - before) / share
+        if not self.direct and "residual" in own:
+            self.warn(not_begun_warning(made, own["residual"], uniform_residual(made.volume.grid, prepared)))
         if left is not None:
             own["unexplained"] = left.share
             self.warn(hiding_warning(made, left))
@@ -167,6 +171,7 @@ class _Judging:
         stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
         if stray is None:
             return None
+        self.stray = stray
         self.metrics[made.method]["stray"] = stray.share
         self.warn(stray_mass_warning(made, stray))
         return stray.map if stray.share > 0 else None
@@ -195,17 +200,38 @@ class _Judging:
         self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}
         return True
 
+    def compare_regions(self) -> None:
+        """SNR and CNR of all volumes by the regions of one: the truth, else FBP of the views, else none of them.
+
+        Regions of the volume itself would give each method others.
+        """
+        reference = self.truth or self.volumes.get(BASELINE)
+        if reference is None and self.direct:
+            reference = self.made.volume
+        if reference is not None:
+            mask = regions(reference, self.context.seed)
+            for name, volume in self.volumes.items():
+                self.metrics[name] |= contrast_by(mask, volume)
+
+    def compare_air(self) -> None:
+        """The level of air of each volume, where the views show it, over the noise of FBP there."""
+        if self.stray is None or BASELINE not in self.volumes:
+            return
+        _, noise = self.stray.level(self.volumes[BASELINE])
+        if noise > 0:  # neither NaN
+            for name, volume in self.volumes.items():
+                self.metrics[name]["air"] = self.stray.level(volume)[0] / noise
+
     def look_for_lost_mass(self) -> bool:
-        """Compare the level of air and weak matter with those of FBP; whether matter was lost."""
+        """Compare weak matter with that of FBP; whether some was lost."""
         lost = False
         if BASELINE not in self.volumes:
             return lost
         fbp = self.volumes[BASELINE]
-        for name, volume in self.volumes.items():
+        for volume in self.volumes.values():
             beside_fbp = compare(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
             if beside_fbp is None:
                 break  # it shows no air
-            self.metrics[name]["air"] = beside_fbp.air
             self.warn(said := lost_mass_warning(self.made, beside_fbp))
             lost = lost or bool(said)
         return lost

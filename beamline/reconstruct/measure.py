@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -82,15 +83,19 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a good volume (k-means), to judge others of the same sample; None without contrast.
+    """Dense and empty regions of a reference, less their rims, to judge volumes of the same sample; None without them.
 
     They are those of `metrics.sampled` of the volume.
     """
-    try:
-        found = metrics.kmeans_mask(metrics.sampled(volume.data), seed)
-    except ValueError:
-        return None
-    return found if all(any((part == kind).any() for part in found) for kind in (0, 1)) else None
+    return metrics.interior_regions(metrics.sampled(volume.data), seed)
+
+
+def contrast_by(mask: NDArray[np.int8] | None, volume: Volume) -> dict[str, float]:
+    """SNR and CNR of a volume by `regions`; empty without them."""
+    if mask is None:
+        return {}
+    snr, cnr = metrics.snr_cnr(metrics.sampled(volume.data), mask)
+    return {"snr": snr, "cnr": cnr}
 
 
 def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.float32], Geometry] | None) -> float:
@@ -105,15 +110,13 @@ def measure(
     volume: Volume,
     prepared: PreparedProjections | None,
     truth: Volume | None,
-    mask: NDArray[np.int8] | None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
-    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With a mask of the dense and empty
-    regions: SNR and CNR. With views: the residual in up to 16 of the views used, and in the views held out where there
-    are any. Of a detector with more than 2^17 pixels only bands of rows with so many pixels are used. `progress` hears
-    how many of these views were compared.
+    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With views: the residual in up to 16 of
+    the views used, and in the views held out where there are any. Of a detector with more than 2^17 pixels only bands
+    of rows with so many pixels are used. `progress` hears how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:
@@ -122,20 +125,44 @@ def measure(
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
         if prepared is not None and prepared.emission is not None:
             values |= metrics.contrast(truth.data, volume.data)
-    if mask is not None:
-        values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
     if prepared is None:
         return {name: float(value) for name, value in values.items()}
-    n = prepared.geometry.n_views
-    some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
-    weights = prepared.ray_factors()
+    some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
     values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights, progress)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
         weights = prepared.ray_factors(unseen.n_views)
-        later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
+        later = (
+            None
+            if weights is None
+            else RayWeights(tuple(factor[prepared.geometry.n_views :] for factor in weights.factors))
+        )
         values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, progress)
     return {name: float(value) for name, value in values.items()}
+
+
+def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
+    """The residual of a cylinder of one density that fills the slices, as of `measure`: the density that leaves least.
+
+    A volume that leaves more shows nothing of the sample yet.
+    """
+    _, y, x = grid.coordinates()
+    inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
+    some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
+    data, density = (
+        prepared.projections.data,
+        float(prepared.projections.data[some].mean()) / (grid.spacing[1] * y.size),
+    )
+
+    def squares(of: float) -> float:
+        cylinder = np.broadcast_to(np.where(inside, np.float32(of), np.float32(0)), grid.shape)
+        volume = Volume(np.ascontiguousarray(cylinder), grid)
+        return _residual(volume, data, prepared.geometry, some, weights, lambda done, count: None) ** 2
+
+    # The squares are 1 - 2 b c + a c² of the density c.
+    plus, minus = squares(density), squares(-density)
+    b, a = (minus - plus) / 4, (plus + minus) / 2 - 1
+    return math.sqrt(max(1 - b**2 / a, 0.0)) if a > 0 else 1.0
 
 
 def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
@@ -166,6 +193,11 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
     except ValueError as error:
         raise DataError(f"{path} cannot be measured so: {error}.") from error
     return {name: float(value) for name, value in values.items()}
+
+
+def _views_compared(geometry: Geometry) -> NDArray[np.int64]:
+    n = geometry.n_views
+    return np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
 
 
 def _residual(

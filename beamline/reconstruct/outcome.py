@@ -126,7 +126,8 @@ class ReconOutcome:
 class ReportContext:
     """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
 
-    `stray` is the map of mass where views show nothing [y, x], None without any.
+    `stray` is the map of mass where views show nothing [y, x], None without any. `elapsed` are the seconds of the whole
+    command until its report is drawn, 0 before.
     """
 
     facts: ScanFacts
@@ -142,6 +143,7 @@ class ReportContext:
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True  # whether there is time for so much before the report
     stray: NDArray[np.float32] | None = None
+    elapsed: float = 0.0
 
 
 def label_of(method: str) -> str:

@@ -44,7 +44,10 @@ def compose(
         summary=_summary(made, prepared, truth, metrics, context),
         scan=context.facts.table,
         settings=settings,
-        metrics={label_of(method): values for method, values in metrics.items()},
+        metrics={
+            label_of(method): {**values, "elapsed": context.elapsed} if method == made.method else values
+            for method, values in metrics.items()
+        },
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
@@ -72,7 +75,8 @@ def _summary(
     best = best if best in own else "seconds"  # a region by FBP is compared with nothing
     summary = (
         f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
-        f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
+        f"{prepared.n_projections} views in {made.seconds:.1f} s ({context.elapsed:.1f} s of the whole command); "
+        f"{METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and made.method != BASELINE:
         summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
@@ -91,20 +95,29 @@ def _footnotes(
     """What the figures of merit mean, as far as there are any."""
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
-        f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
-        "smoother volume has more of both, though it may show less: look for cracks and pores in the pictures.",
+        "Time of the whole command: from its start to this page, with reading, correction and measuring.",
     ]
+    if any("cnr" in values for values in metrics.values()):
+        footnotes.append(
+            "SNR, CNR: between the dense and the empty part (k-means of two classes) of "
+            f"{'the truth' if truth else 'FBP of these views'}, without voxels near the other part; the same of all "
+            "volumes. A smoother volume has more of both, though it may show less: look for cracks and pores in the "
+            "pictures."
+        )
     if any("air" in values for values in metrics.values()):
         footnotes.append(
-            "Level of air: the mean where FBP has no matter, over the deviation of FBP there (blocks of voxels). "
-            "Air of FBP that is below zero is missing from the other volume's weak matter."
+            "Level of air: the mean of the voxels that views show to be empty, within the field of all views, over the "
+            "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter."
         )
     if made.grew:
         footnotes.append(
-            "Time of R²-Gaussian: from the first look at the growing file to the volume; it includes the scan."
+            "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
+            "the scan."
         )
     if "resumed_from" in made.settings:
-        footnotes.append(f"Time of {label_of(made.method)}: since the fit was resumed, without the time before.")
+        footnotes.append(
+            f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before."
+        )
     if left is not None:
         footnotes.append(
             f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "

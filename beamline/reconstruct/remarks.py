@@ -52,6 +52,23 @@ def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
     )
 
 
+def not_begun_warning(made: ReconOutcome, left: float, uniform: float) -> str:
+    """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a cylinder.
+
+    Args:
+        left: residual of the volume. uniform: that of a cylinder of one density, see `measure.uniform_residual`.
+    """
+    if left < uniform or by_name(made.method).traits.direct:
+        return ""
+    last = made.history[-1] if made.history else None
+    steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
+    return (
+        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the views, where a "
+        f"cylinder of one density that fills the field leaves {uniform:.3g}. The method ended in {made.seconds:.3g} "
+        f"s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method fbp."
+    )
+
+
 def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
     """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
     if left.share <= unexplained.LIMIT or by_name(made.method).traits.direct:

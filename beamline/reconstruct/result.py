@@ -48,7 +48,8 @@ def write_result(
     phases = context.phases
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
-    context = replace(context, warnings=judged.remarks, stray=judged.stray)
+    elapsed = clock.now() - context.started
+    context = replace(context, warnings=judged.remarks, stray=judged.stray, elapsed=elapsed)
     own = judged.metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)

@@ -38,7 +38,7 @@ def series_page(record: ReconRecord, context: ReportContext, n_views: int, chose
         f"{n_views} views; {moves}{'; ' * bool(chosen)}{chosen}.",
         scan=context.facts.table,
         settings=said,
-        metrics={"one fit": record.metrics},
+        metrics={"one fit": {**record.metrics, "elapsed": context.elapsed}},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=pictures,

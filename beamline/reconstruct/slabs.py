@@ -46,7 +46,7 @@ SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
 _BATCH = 0.25  # share of it for views during correction
 _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
-_REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
+_REGIONS, _REGION = 2**24, 12  # voxels at most of the regions that judge volumes (`metrics.sampled`); bytes of a voxel
 _NO_STEPS = StepMemory()
 _EMISSION = 6 * 4  # bytes a pixel: counts, survival, background and weights, and what they are made of
 _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
@@ -129,7 +129,7 @@ class Needs:
         """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
         looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
-        found = min(self.volume // 4, _REGIONS) + max(odd, *looks)
+        found = max(odd, _REGION * min(self.volume // 4, _REGIONS), *looks)
         return found if found > _ASIDE else 0
 
     @property

@@ -185,6 +185,7 @@ def reconstruct_series(
         times = times_of(source, prepared.projections.view_ids, warn)
     options.target.require_room(SeriesNeeds.of(options, wanted, prepared.geometry).output)
     phases.enter("reconstruction")
+    fit_began = clock.now()
     early, heard = False, sweeps_told(counting, _SWEEPS)
 
     def go_on(sweep: int, residual: float) -> bool:
@@ -206,7 +207,7 @@ def reconstruct_series(
             early = early or stopping()
     except ValueError as error:
         raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
-    chosen = ""
+    chosen, fit_seconds = "", clock.now() - fit_began
     if made.unseen_residuals is not None:
         still, moved = made.unseen_residuals
         chosen = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
@@ -217,11 +218,18 @@ def reconstruct_series(
     if made.smooth is not None:
         settings["smooth"] = made.smooth
     outcome = ReconOutcome(
-        Volume(series.data[0], made.grid), "series", clock.now() - began, (),
+        Volume(series.data[0], made.grid), "series", fit_seconds, (),
         settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}), options.filter,
     )  # fmt: skip
     context = ReportContext(
-        facts, options.selection, options.command, options.seed, warn.messages, recipe=options.recipe
+        facts,
+        options.selection,
+        options.command,
+        options.seed,
+        warn.messages,
+        began,
+        recipe=options.recipe,
+        elapsed=clock.now() - began,
     )
     record = ReconRecord(
         volume=prepared.stretched(outcome.volume),

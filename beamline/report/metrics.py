@@ -31,7 +31,8 @@ METRICS = {
     "unexplained": Metric("Matter that leaves structure", "", 4, "lower is better"),
     "stray": Metric("Mass where views show nothing", "", 4, "lower is better"),
     "air": Metric("Level of air, in noise of FBP", "", 2, "nearer to 0 is better"),
-    "seconds": Metric("Time", "s", 1, "lower is better"),
+    "seconds": Metric("Time of reconstruction", "s", 1, "lower is better"),
+    "elapsed": Metric("Time of the whole command", "s", 1, "lower is better"),
 }
 
 

@@ -49,7 +49,12 @@ class EnergyScan:
     def series(self) -> Series:
         """Its radiographs, computed lazily."""
         title = f"{self.material} in {self.name}, simulated"
-        return Series(title, self.energies.size, self.frames(self.energies), self.regions)
+        own = [
+            c.material for c in self.sample.constituents if c.material is not None and c.material.name == self.material
+        ]
+        elements = tuple(sorted({z for material in own for z, _ in material.fractions}))
+        frames = self.frames(self.energies)
+        return Series(title, self.energies.size, frames, self.regions, self.material, elements)
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
         """(keV, line integrals [row, col]) of each energy, with all the effects of the scene. First comes a dark level,

@@ -16,7 +16,6 @@ from beamline.core.events import Done, Event, Sink, StudyStarted, TrialDone, Tri
 from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
-from beamline.reconstruct.measure import regions
 from beamline.report.slice_sheet import SliceSheet
 from beamline.study.figures import write_page
 from beamline.study.studies import Study, StudyRow, ViewSet, averaged
@@ -30,7 +29,6 @@ from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
-from recon.base.volume import Volume
 from recon.methods import BASELINE
 from recon.voxels.emission import Emission, weighted_lines
 from recon.voxels.fbp import Filter
@@ -67,7 +65,7 @@ class _Judge:
     Attributes:
         reference: FBP of all views, on `Grid.matching` of their geometry.
         truth: on the same grid; None where nobody knows it.
-        mask: of the dense and the empty regions, see `regions`; None without two.
+        mask: of the dense and the empty regions, see `_regions`; None without two.
     """
 
     reference: F32
@@ -82,6 +80,14 @@ class _Judge:
         if self.mask is not None:
             found["snr"], found["cnr"] = metrics.snr_cnr(metrics.sampled(volume), self.mask)
         return found
+
+
+def _regions(reference: F32, seed: int) -> NDArray[np.int8] | None:
+    """Dense and empty regions, whole as published; None without contrast."""
+    try:
+        return metrics.kmeans_mask(metrics.sampled(reference), seed)
+    except ValueError:
+        return None
 
 
 def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> StudyTable:
@@ -115,13 +121,13 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
         if (rays := scan.prepared.rays_there()) is not None:
             write_array(work / "rays.npy", rays)
         rig = Rig(work, scan.prepared.geometry, options.seed, options.settings, scan.prepared.emission)
-        grid, truth = scan.grid, scan.truth
+        truth = scan.truth
         del scan, rays  # from here on the views are in the file alone
         whole = StudyRow(REFERENCE, np.arange(rig.geometry.n_views)[:, None])
         reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
         if reference is None:
             raise DataError(f"{path}: the FBP of all views, to compare with, failed: {outcome.message}")
-        judge = _Judge(reference, truth, regions(Volume(reference if truth is None else truth, grid), options.seed))
+        judge = _Judge(reference, truth, _regions(reference if truth is None else truth, options.seed))
         slices.add(REFERENCE, reference)
         if truth is not None:
             slices.add("truth", truth)
@@ -146,7 +152,7 @@ def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
     notes = [
         f"PSNR and SSIM are against the {REFERENCE} ({geometry.n_views}, {options.filter}): it has noise and streaks "
         "of its own, which rows share as far as they share its views.",
-        "SNR and CNR are of the dense and the empty region (k-means of the "
+        "SNR and CNR are of the whole dense and empty region, with their rims (k-means of the "
         + ("truth" if truth else "FBP of all views")
         + "); a smoother volume has more.",
     ]

@@ -21,11 +21,26 @@ from beamline.xafs.edge import AbsorptionEdge
 
 @dataclass(frozen=True, eq=False)
 class XafsResult:
-    """The curve of an energy scan and its edge. `title`: what was scanned."""
+    """The curve of an energy scan and its edge.
+
+    Attributes:
+        title: what was scanned.
+        material, elements: its name and atomic numbers, of a scene; empty: not known, as of a measured file.
+    """
 
     title: str
     curve: XafsCurve
     edge: AbsorptionEdge
+    material: str = ""
+    elements: tuple[int, ...] = ()
+
+    @property
+    def tabulated(self) -> str:
+        """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
+        from beamline.xafs.tabulated import said_of  # lazily: it imports xraylib, which takes a while
+
+        low, high = (float(end) for end in self.curve.energies[[0, -1]])
+        return said_of(self.material, self.elements, low, high, self.edge.energy)
 
     @property
     def criterion(self) -> str:
@@ -46,6 +61,7 @@ class XafsResult:
             "edge_seen": edge.found,
             "why_not": edge.reason or None,
             "edge_kev": edge.energy,
+            "tabulated": self.tabulated or None,
             "white_line_kev": edge.white_line,
             "best_kev": curve.energies[curve.best],
             "best_by": self.criterion,
@@ -73,6 +89,7 @@ def lines(result: XafsResult) -> list[str]:
             if edge.white_line is None
             else f"white line  {edge.white_line:.4f} keV, the top of the absorption"
         )
+    text += [f"{'in tables':<12}{result.tabulated}"] if result.tabulated else []
     first, last = curve.nearly_best
     cnr = curve.contrast_to_noise
     height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel at this thickness"

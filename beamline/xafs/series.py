@@ -28,20 +28,25 @@ class Series:
         frames: (keV, line integrals [row, col]) of each energy, in any order; +inf where a pixel is dark, NaN
             without a value.
         regions: pixels that are compared.
+        material, elements: name and atomic numbers of the material; empty: not known.
     """
 
     title: str
     n: int
     frames: Iterable[tuple[float, Reals]]
     regions: ContrastRegions
+    material: str = ""
+    elements: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesResult:
-    """A curve; `stopped` where it ended before its last energy."""
+    """A curve; `stopped` where it ended before its last energy. `material`, `elements`: as of the series."""
 
     curve: XafsCurve
     stopped: bool = False
+    material: str = ""
+    elements: tuple[int, ...] = ()
 
 
 def run_series(series: Series, sink: Sink, clock: Clock, should_stop: Callable[[], bool]) -> SeriesResult:
@@ -65,4 +70,5 @@ def run_series(series: Series, sink: Sink, clock: Clock, should_stop: Callable[[
         if done < series.n and should_stop():
             stopped = True
             break
-    return SeriesResult(curve_of(np.array(energies), points, series.regions), stopped)
+    curve = curve_of(np.array(energies), points, series.regions)
+    return SeriesResult(curve, stopped, series.material, series.elements)

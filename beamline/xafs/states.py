@@ -25,11 +25,14 @@ def lines(states: Sequence[XafsResult]) -> list[str]:
     for state in states:
         edge = state.edge
         if edge.energy is None:
-            text.append(f"{state.title:<{width}}  no edge: {edge.reason}")
+            why = "; ".join(part for part in (edge.reason, state.tabulated) if part)
+            text.append(f"{state.title:<{width}}  no edge: {why}")
             continue
         top = "no white line" if edge.white_line is None else f"white line {edge.white_line:.4f} keV"
         apart = "" if first is None or state is states[0] else f", {(edge.energy - first) * 1e3:+.2f} eV from the first"
         text.append(f"{state.title:<{width}}  edge {edge.energy:.4f} keV, {top}{apart}")
+    if first is not None and states[0].tabulated:
+        text.append(f"{'in tables':<{width}}  {states[0].tabulated}")
     return text
 
 

@@ -24,25 +24,21 @@ _BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 @dataclass(frozen=True)
 class Comparison:
-    """A volume beside an FBP of the same views.
+    """What a volume lost of an FBP of the same views.
 
     Attributes:
-        air: level of the volume where FBP shows no matter, over `noise`.
-        noise: standard deviation of FBP there, in blocks of voxels.
         lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.
         kept: mass in that region over the mass in FBP, each above its own air.
     """
 
-    air: float
-    noise: float
     lost: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
     kept: float = 1.0
 
 
 def compare(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> Comparison | None:
-    """The air of a volume, and the largest region in which it lost weak matter that the reference shows.
+    """The largest region in which a volume lost weak matter that the reference shows above its own air.
 
-    Both in blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
+    In blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
     of 3 x 5 x 5 blocks [z, y, x]: streaks are thinner.
 
     Args:
@@ -73,7 +69,7 @@ def compare(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) 
     if noise == 0 or air.sum() < _LEAST_AIR:
         return None
     own = float(found[air].mean(dtype=np.float64))
-    comparison = Comparison(own / noise, noise)
+    comparison = Comparison()
     gone = matter & (found - own < _LEFT * (shown - level))
     core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
     parts, n = label(binary_opening(gone, np.ones(core)))
@@ -84,7 +80,7 @@ def compare(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) 
     region = parts == at + 1
     kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
     spans = tuple((part.start * factor, part.stop * factor) for part in find_objects(parts)[at])
-    return Comparison(own / noise, noise, (spans[0], spans[1], spans[2]), kept)
+    return Comparison((spans[0], spans[1], spans[2]), kept)
 
 
 def _blocks(volume: F32, factor: int) -> F32:

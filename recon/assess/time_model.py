@@ -35,7 +35,7 @@ class NextDecibel:
         return math.isfinite(self.seconds)
 
 
-def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
+def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel | None:
     """Extrapolate a fit's record of residual against time by one decibel.
 
     In the second half of the time -20 log10 of the residual is fitted by a line in log t, which is how fits slow down.
@@ -45,18 +45,21 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
     Args:
         seconds: since the start of the reconstruction, rising.
         residuals: of the same length; values that are not positive numbers are left out.
+
+    Returns:
+        None for a record too short to tell.
     """
     t, q = record(seconds, residuals)
     none = NextDecibel(math.inf, math.inf, math.inf)
     late = t >= 0.5 * t[-1] if t.size else np.zeros(0, bool)
     t, q = t[late], q[late]
     if t.size < 6:
-        return none
+        return None
     groups = np.array_split(np.arange(t.size), min(_POINTS, t.size // 2))
     x = np.array([np.log(t[g]).mean() for g in groups])
     y = np.array([q[g].mean() for g in groups])
     if x.size < 3 or np.ptp(x) == 0:
-        return none
+        return None
     x -= x.mean()
     slope = float(x @ y / (x @ x))  # dB for each factor of e in time
     scatter = y - y.mean() - slope * x

@@ -146,7 +146,8 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
             device that is not there.
 
     Warns:
-        UserWarning: rays have a width, which a field does not know; or densities reach the highest one.
+        UserWarning: rays have a width, which a field does not know; densities reach the highest one; or the seconds
+            ended before every view was seen once.
     """
     begin, geometry = control.now(), problem.geometry
     try:
@@ -168,6 +169,14 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     views = _Views(data / np.float32(edge * unit), weights, geometry, grid)
     fit = _Fit(method, views, problem, begin, control)
     fit.run(used, kept)
+    if method.seconds is not None and fit.step < min(used.size, method.steps):
+        pace = fit.seconds_of_steps / max(fit.step, 1)
+        warnings.warn(
+            f"the {method.label} field ended after {fit.step} of {method.steps} steps, before it saw each of its "
+            f"{used.size} views once: its volume shows little of the sample. A step takes about {pace:.2g} s here, so "
+            f"give about {pace * used.size:.2g} s more for each view once, {pace * method.steps:.2g} s for all steps",
+            stacklevel=2,
+        )
     volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)
     if not method.allow_negative and volume.data.max(initial=0) > _TOP * method.highest * unit:
         warnings.warn(
@@ -204,7 +213,7 @@ class _Fit:
         self.samples, self.step = method.samples_of(self.across), 0
         self.history: list[Progress] = []
         self.loss = self.residual = self.held_out = float("nan")
-        self.looks, self.best = 0, _Best()
+        self.looks, self.best, self.seconds_of_steps = 0, _Best(), 0.0
 
     def run(self, used: Places, kept: Places) -> None:
         method, now = self.method, self.control.now
@@ -230,6 +239,7 @@ class _Fit:
                 break
             if method.early_stop and self.looks - self.best.look > _PATIENCE:
                 break
+        self.seconds_of_steps = now() - started
         if judges:
             self._look(judges)
         self._report(len(used))

@@ -1,4 +1,4 @@
-"""Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening.
+"""Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening, and its edges.
 
 Cross sections are those of xraylib from 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The
 simulator reads the same tables and states the same compositions and densities. All formulas here are separate: no
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
 
@@ -49,6 +50,37 @@ KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
     }
 )
 """Density in g/cm³ and parts of the mass; see simulators.light.palette for the sources."""
+
+
+_SHELLS = {"K": xraylib.K_SHELL, "L1": xraylib.L1_SHELL, "L2": xraylib.L2_SHELL, "L3": xraylib.L3_SHELL}
+HEAVIEST = 92  # atomic number of the heaviest element of matter, uranium
+
+
+@dataclass(frozen=True)
+class TabulatedEdge:
+    """An absorption edge of a free atom; `energy` in keV. Compounds lie a few electronvolts higher."""
+
+    element: str
+    shell: str
+    energy: float
+
+    @property
+    def named(self) -> str:
+        """Element, shell and energy."""
+        return f"{self.element} {self.shell} {self.energy:.4f} keV"
+
+
+def edges_of(elements: Iterable[int]) -> list[TabulatedEdge]:
+    """K and L edges of elements, by atomic number, rising."""
+    found = []
+    for z in elements:
+        for shell, number in _SHELLS.items():
+            try:
+                energy = float(xraylib.EdgeEnergy(z, number))
+            except ValueError:  # the element has no such shell
+                continue
+            found.append(TabulatedEdge(xraylib.AtomicNumberToSymbol(z), shell, energy))
+    return sorted(found, key=lambda edge: edge.energy)
 
 
 def delta_beta(name: str, energy_kev: float) -> float:

@@ -23,6 +23,7 @@ _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005  # pixels; of the blurred noise; of the
 _WHOLE = 0.999  # share of a voxel's rays through air
 _MOST, _MOST_WHOLE = 2**18, 2**21  # voxels looked at, or one slice; where rows show no slices, those of a volume
 _WORK = 40  # bytes of a voxel that is looked at
+_LEAST_AIR = 100  # voxels whose level counts
 _MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it that counts
 
 
@@ -34,11 +35,22 @@ class StrayMass:
         empty: share of the voxels that are shown to be empty.
         share: of the volume's mass that lies in them, counting densities above a twentieth of the density unit.
         map: float32 [y, x], the highest density above each other in these voxels.
+        first: number of the first slice that was looked at.
+        air: bool [slice, y, x], those of these voxels that every view looked at sees: beyond, FBP means nothing.
     """
 
     empty: float
     share: float
     map: F32
+    first: int
+    air: Mask
+
+    def level(self, volume: Volume) -> tuple[float, float]:
+        """Mean and standard deviation of a volume on the same grid in `air`; NaN where that has under 100 voxels."""
+        values = volume.data[self.first : self.first + len(self.air)][self.air]
+        if values.size < _LEAST_AIR:
+            return math.nan, math.nan
+        return float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
 
 
 def stray_mass(
@@ -53,7 +65,7 @@ def stray_mass(
     Returns:
         None if no voxel is shown to be empty, the volume holds no matter, or it is large and its slices are no rows.
     """
-    nz, looked_at = volume.grid.shape[0], _looked_at(geometry, volume.grid)
+    nz, looked_at, first = volume.grid.shape[0], _looked_at(geometry, volume.grid), 0
     if looked_at == 0:
         return None
     if nz > looked_at:
@@ -62,14 +74,14 @@ def stray_mass(
         geometry, projections = geometry.rows(band.start, band.stop), projections[:, band]
         weights = None if weights is None else weights[:, band]
         volume = Volume(np.ascontiguousarray(volume.data[band]), Grid.matching(geometry))
-    empty = seen_empty(projections, geometry, volume.grid, weights)
+    empty, by_all = _empty_and_seen(projections, geometry, volume.grid, weights)
     matter = np.maximum(volume.data, 0)
     positive = matter[matter > 0]
     if not empty.any() or not positive.size:
         return None
     stray = np.where(empty & (matter > _FAINT * np.percentile(positive, _MATTER)), matter, 0)
     share = float(stray.sum(dtype=np.float64) / matter.sum(dtype=np.float64))
-    return StrayMass(float(empty.mean()), share, stray.max(axis=0))
+    return StrayMass(float(empty.mean()), share, stray.max(axis=0), first, empty & by_all)
 
 
 def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
@@ -99,20 +111,28 @@ def seen_empty(projections: F32, geometry: Geometry, grid: Grid, weights: F32 | 
     A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
     within 0.5 % of the thick parts. So matter much thinner than that counts as none.
     """
+    return _empty_and_seen(projections, geometry, grid, weights)[0]
+
+
+def _empty_and_seen(
+    projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None
+) -> tuple[Mask, Mask]:
+    """As `seen_empty`, and the voxels that are on the detector in all of these views, [z, y, x] each."""
     some = np.unique(np.linspace(0, geometry.n_views - 1, min(geometry.n_views, _VIEWS)).round().astype(np.intp))
     data, known = masked(projections[some], None if weights is None else weights[some])
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur
     limit = max(_SIGMAS * noise, _LEAST * float(np.percentile(data, 99)))
     views = replace(geometry.select(some), skew=0.0) if geometry.skew else geometry.select(some)
-    votes = np.zeros(grid.shape, np.int16)
+    votes, by_all = np.zeros(grid.shape, np.int16), np.ones(grid.shape, bool)
     for view, image in enumerate(data):
         air = gaussian_filter(image, _BLUR) < limit
         if known is not None:
             air &= known[view] > 0
+        one = Projector(views.select([view]), grid)
+        through_all = one.adjoint(np.ones((1, *air.shape), np.float32))
+        by_all &= through_all > 0
         if not air.any():
             continue
-        one = Projector(views.select([view]), grid)
         through_air = one.adjoint(air[None].astype(np.float32))
-        through_all = one.adjoint(np.ones((1, *air.shape), np.float32))
         votes += (through_all > 0) & (through_air >= np.float32(_WHOLE) * through_all)
-    return votes >= _AGREE
+    return votes >= _AGREE, by_all

@@ -165,6 +165,9 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
         weights: float64 [energy], of sum 1.
         thickness: mm, the longest path through matter.
         tolerance: largest change of the transmitted light, as a share of the open beam.
+
+    Returns:
+        All energies where fewer do not suffice, or are not found.
     """
     n_materials = attenuation.shape[1]
     ways = [np.eye(n_materials)]
@@ -175,7 +178,10 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     rays = (lengths[:, None, None] * np.concatenate(ways)).reshape(-1, n_materials)
     through = np.exp(-rays @ attenuation.T)
     light = through @ weights
-    exact, _ = nnls(through, light)
+    try:
+        exact, _ = nnls(through, light)
+    except RuntimeError:  # so nearly dependent, as around an edge, that it does not converge
+        return np.arange(weights.size), weights
     enough = np.flatnonzero(exact)
     through = through[:, enough]
     chosen: list[int] = []

@@ -9,8 +9,9 @@ import pytest
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import measure, uniform_residual
 from beamline.reconstruct.outcome import ReconOutcome
-from beamline.reconstruct.remarks import needles_warning, odd_views_warning, stray_mass_warning
+from beamline.reconstruct.remarks import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.prep.correct import Projections
@@ -85,3 +86,34 @@ def test_views_like_the_volume_and_direct_methods_are_not_named(
     rng: np.random.Generator, method: str, specks: dict[int, float]
 ) -> None:
     assert odd_views_warning(*_made(rng, specks, method), Selection()) == ""
+
+
+@pytest.mark.parametrize("method", ["naf", "r2", "sirt", "os-sirt-tv"])
+@pytest.mark.parametrize(("amount", "begun"), [(0.0, False), (1.0, True)])
+def test_a_volume_of_one_density_is_said_to_show_nothing(
+    method: str, amount: float, begun: bool, rng: np.random.Generator
+) -> None:
+    """Whatever method ended before it had begun, and whatever density it began from."""
+    made, prepared = _made(rng, {}, method)
+    blank = np.float32(0.7 * made.volume.data.mean())
+    volume = replace(made.volume, data=amount * made.volume.data + (1 - amount) * blank)
+    left = measure(volume, prepared, None)["residual"]
+    said = not_begun_warning(replace(made, volume=volume), left, uniform_residual(volume.grid, prepared))
+    assert (said == "") is begun
+    assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
+
+
+def test_the_residual_of_a_uniform_cylinder_in_closed_form() -> None:
+    """Views of that cylinder leave nothing; of those of two densities the least squares leave their scatter."""
+    made, prepared = _made(np.random.default_rng(0), {}, "sirt")
+    grid = made.volume.grid
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    full = Volume((np.hypot(y, x) < 24).astype(np.float32), grid)
+    shadow = project(full, prepared.geometry)
+    factors = np.where(np.arange(40) % 2, 1.5, 0.5).astype(np.float32)[:, None, None]
+    for data, expected in ((shadow, 0.0), (factors * shadow, None)):
+        views = replace(prepared, projections=replace(prepared.projections, data=data))
+        some = np.unique(np.linspace(0, 39, 16).round().astype(int))
+        f = factors[some, 0, 0]
+        exact = np.sqrt(1 - f.sum() ** 2 / (f.size * (f**2).sum())) if expected is None else expected
+        assert uniform_residual(grid, views) == pytest.approx(exact, abs=0.01)

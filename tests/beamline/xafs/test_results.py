@@ -27,16 +27,21 @@ def test_people_are_told_edge_line_and_best() -> None:
         "NMC811: 11 energies, 8.3000 to 8.4000 keV",
         "edge        8.3437 keV, where the absorption rises most steeply",
         "white line  8.3485 keV, the top of the absorption",
+        "in tables   Ni K 8.3328 keV, 10.9 eV below; Er L3 8.3579 keV, 14.2 eV above",
         "best        8.4000 keV: highest contrast-to-noise of 20 a pixel at this thickness "
         "(95 % of it from 8.3900 to 8.4000 keV)",
     ]
     bare = replace(FOUND, edge=replace(SEEN, white_line=None), curve=XafsCurve(ENERGIES, ABSORPTION))
     assert lines(bare)[2:] == [
         "white line  none above the edge within the range",
+        "in tables   Ni K 8.3328 keV, 10.9 eV below; Er L3 8.3579 keV, 14.2 eV above",
         "best        8.4000 keV: highest absorption (95 % of it from 8.3900 to 8.4000 keV)",
     ]
     none = replace(FOUND, edge=AbsorptionEdge(False, "it is smooth", None, None, 0.0, 0.0))
     assert lines(none)[1] == "no edge     it is smooth"
+    lacking = replace(none, material="LiCoO2", elements=(3, 8, 27))
+    assert "LiCoO2 has no edge from 8.3000 to 8.4000 keV: its nearest is Co K" in lines(lacking)[2]
+    assert lacking.data()["tabulated"] in lines(lacking)[2]
     dark = replace(FOUND, curve=replace(FOUND.curve, left_out=np.array([8.41, 8.42])))
     assert lines(dark)[1] == (
         "left out    2 energies between 8.4100 and 8.4200 keV: too dark, too bright for the sensor, or without values"

@@ -1,4 +1,4 @@
-"""Lost mass: the air of a volume beside that of FBP, and weak matter that only FBP shows."""
+"""Lost mass: weak matter that only FBP shows, above its own air."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_weak_matter_that_was_clipped_with_its_air_is_named_by_its_region() -> N
     assert top <= 10 and bottom >= 20 and max(across[0], along[0]) <= 22 and min(across[1], along[1]) >= 42
     assert 0.2 < found.kept < 0.4  # 0.0015 - 0.001 of 0.0015
     own = compare(shown, shown)
-    assert own is not None and own.lost is None and own.air * own.noise == pytest.approx(-0.001, rel=0.05)
+    assert own is not None and own.lost is None
 
 
 def test_slices_without_beam_have_lost_nothing() -> None:
@@ -38,14 +38,14 @@ def test_slices_without_beam_have_lost_nothing() -> None:
     found[~seen] = 0  # no ray says what is there; FBP shows what was filled in
     unaware, beside = compare(found, shown), compare(found, shown, seen)
     assert unaware is not None and unaware.lost is not None
-    assert beside is not None and beside.lost is None and abs(beside.air) < 1
+    assert beside is not None and beside.lost is None
 
 
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
 def test_a_volume_that_is_smoother_or_has_no_noise_has_lost_nothing(sigma: float) -> None:
     shown, clean = _fbp(0.0), np.maximum(gaussian_filter(_fbp(0.0, noise=0.0), sigma), 0)
     found = compare(clean, shown)
-    assert found is not None and found.lost is None and abs(found.air) < 1
+    assert found is not None and found.lost is None
 
 
 def test_streaks_beside_dense_matter_are_no_matter_that_was_lost() -> None:

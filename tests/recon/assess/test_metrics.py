@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from recon.assess import metrics
 from recon.assess.metrics import (
     inscribed_cuboid,
+    interior_regions,
     kmeans_mask,
     nrmse,
     psnr,
@@ -125,6 +128,40 @@ def test_kmeans_finds_the_particles_and_leaves_the_wall_out(rng: np.random.Gener
     assert (mask[outside] == -1).all()
     assert (mask[box] >= 0).all()
     np.testing.assert_array_equal(mask, kmeans_mask(volume, seed=2))
+
+
+@given(volume=arrays(np.float64, (1, 12, 12), elements=st.floats(-5, 5).map(lambda x: round(x, 2))))
+def test_the_two_parts_have_the_least_squares_of_all(volume: NDArray[np.float64]) -> None:
+    """Lloyd's iterations may end in another split, which a little noise then turns over."""
+    used = volume[inscribed_cuboid(volume.shape)].ravel()
+    assume(np.ptp(used) > 0)
+    mask = kmeans_mask(volume)
+
+    def squares(low: NDArray[np.bool_]) -> float:
+        return sum(float(part.size * part.var()) for part in (used[low], used[~low]) if part.size)
+
+    least = min(squares(used <= cut) for cut in np.unique(used))
+    assert squares(mask[mask >= 0] == 0) == pytest.approx(least, abs=1e-9)
+
+
+def test_interior_regions_hardly_depend_on_the_reference(rng: np.random.Generator) -> None:
+    """Noise and an edge that is elsewhere in the reference leave the figures of a volume as they are."""
+    clean, _ = particles(rng, 0.0)
+    volume = clean + rng.normal(0, 0.2, clean.shape).astype(np.float32)
+    references = [clean, volume, gaussian_filter(clean, 1.0), np.roll(volume, 1, axis=2)]
+    references.append(clean + rng.normal(0, 0.6, clean.shape).astype(np.float32))
+    masks = [interior_regions(reference) for reference in references]
+    assert all(mask is not None for mask in masks)
+    found = [snr_cnr(volume, mask) for mask in masks if mask is not None]
+    assert np.ptp(found, axis=0).max() < 0.3
+    assert found[0] == pytest.approx((20 * np.log10(3 / 0.2), 20 * np.log10(2 / 0.2)), abs=0.1)
+
+
+def test_regions_without_an_interior_are_none() -> None:
+    stripes = np.zeros((4, 40, 40), np.float32)
+    stripes[:, :, ::2] = 1
+    assert interior_regions(stripes) is None
+    assert interior_regions(np.ones((4, 40, 40), np.float32)) is None
 
 
 def test_snr_and_cnr_in_closed_form(rng: np.random.Generator) -> None:

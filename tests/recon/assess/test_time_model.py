@@ -75,7 +75,7 @@ def test_a_fit_of_the_default_length_has_no_decibel_in_reach() -> None:
     [([], []), ([1.0], [0.1]), ([1, 2, 3], [0.1, 0.09, 0.08]), ([1, 2, 3, 4], [np.nan] * 4), (range(9), [0.0] * 9)],
 )
 def test_records_too_short_to_tell(seconds: list[float], residuals: list[float]) -> None:
-    assert not next_decibel(seconds, residuals).measurable
+    assert next_decibel(seconds, residuals) is None
 
 
 @given(st.floats(0.1, 900))

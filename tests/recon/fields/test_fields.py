@@ -86,6 +86,16 @@ def test_a_time_ends_a_fit() -> None:
     assert 5 < found.settings["steps"] < 60
 
 
+@pytest.mark.parametrize("name", list(SMALL))
+def test_a_time_that_ends_a_fit_before_it_saw_every_view_is_told(name: str) -> None:
+    _, data = box(VIEWS["parallel"])
+    clock = itertools.count()
+    method = replace(SMALL[name], steps=10_000, seconds=5.0)
+    with pytest.warns(UserWarning, match=r"ended after \d of 10000 steps, before it saw each of its \d+ views once"):
+        found = recon.reconstruct(data, VIEWS["parallel"], method, control=RunControl(now=lambda: float(next(clock))))
+    assert found.settings["steps"] < VIEWS["parallel"].n_views
+
+
 def test_views_held_out_choose_the_network() -> None:
     _, data = box(VIEWS["parallel"])
     noisy = data + np.random.default_rng(0).normal(0, 0.2, data.shape).astype(np.float32)

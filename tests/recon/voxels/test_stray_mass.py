@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,3 +76,21 @@ def test_few_views_leave_less_in_the_air_of_a_fit_than_of_fbp(count: int, rng: n
         assert found is not None
         shares.append(found.share)
     assert shares[0] > LIMIT > 0.02 > shares[1]
+
+
+@pytest.mark.parametrize("axis", [0.0, 5.0])
+def test_the_level_of_air_is_where_every_view_sees_none(axis: float, rng: np.random.Generator) -> None:
+    """Beyond the field of all views FBP means nothing; matter that fills most of it is no air."""
+    wide = Geometry.parallel(np.linspace(0, np.pi, 30, endpoint=False), (32, 38), pixel_pitch=0.04)
+    geometry = replace(wide, axis_col=wide.axis_col + axis)
+    grid = recon.Grid.matching(geometry)
+    truth = smooth_ball(grid, AXES, CENTRE)
+    level = truth - 0.02
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    for angle in geometry.angles:
+        col = geometry.axis_col + (x * np.cos(angle) + y * np.sin(angle)) / 0.04
+        level[(col < -1.5) | (col > 38.5)] = 7.0
+    found = stray_mass(recon.Volume(level, grid), scan(geometry, rng), geometry)
+    assert found is not None and found.air.sum() > 1000
+    mean, spread = found.level(recon.Volume(level, grid))
+    assert mean == pytest.approx(-0.02, abs=1e-3) and spread < 2e-3
