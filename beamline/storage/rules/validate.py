@@ -33,6 +33,7 @@ __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 _FARTHEST = 1e6  # degrees
+_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 SAMPLES = 4  # frames of a kind that are looked at
@@ -198,7 +199,8 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
+            f"The projections span {span:.2f} degrees: less than half a turn (limited angle)."
+            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 
