@@ -260,6 +260,8 @@ def ingest(
         return
     click.echo(f"output   {done.path} ({done.definition})")
     click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
+    for doubt in done.doubts:
+        click.echo(f"! {doubt}")
     click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")
 
 

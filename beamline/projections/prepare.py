@@ -290,11 +290,11 @@ def assemble(
         shares=None if on_disk else shares_of(slice(None), slice(0, height)),
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
-        stretch=_stretch(source, geometry),
+        stretch=_stretch(source, geometry, resampled=resampling is not None),
     )
 
 
-def _stretch(source: ScanSource, geometry: Geometry) -> float:
+def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:
     """Height of the source's pixels over their width.
 
     Raises:
@@ -302,7 +302,7 @@ def _stretch(source: ScanSource, geometry: Geometry) -> float:
     """
     if source.row_pitch_mm is None or source.pixel_size_mm is None:
         return 1.0
-    if not geometry.rows_show_slices:
+    if resampled or not geometry.rows_show_slices:
         raise DataError(
             f"{source.path}: pixels are {source.pixel_size_mm:g} mm wide and {source.row_pitch_mm:g} mm high; expected "
             "square ones where views are moved along the axis, turned, or of a cone. Bin the columns or the rows of a "

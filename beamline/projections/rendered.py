@@ -49,6 +49,8 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             ) from None
     if source.cone is not None:
         raise DataError(f"{source.path} is a cone-beam scan; views are compared with volumes of parallel beams only.")
+    if source.row_pitch_mm is not None:
+        raise DataError(f"{source.path} has pixels that are not square; volumes are of square ones.")
     if beyond:
         raise DataError(
             f"{path} is of views with {' and '.join(beyond)}, which are not rendered here. Reconstruct this scan "

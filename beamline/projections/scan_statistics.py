@@ -143,8 +143,9 @@ def _gray(material: str, source: ScanSource, photons: float) -> float:
     if source.pixel_size_mm is None or source.energy_kev is None:
         missing = "pixel size" if source.pixel_size_mm is None else "energy"
         raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
+    height = source.pixel_size_mm if source.row_pitch_mm is None else source.row_pitch_mm
     try:
-        return absorbed_dose(material, source.energy_kev, photons / source.pixel_size_mm**2)
+        return absorbed_dose(material, source.energy_kev, photons / (source.pixel_size_mm * height))
     except ValueError as error:
         raise ConfigError(f"--dose-in {material}: {error}.") from error
 

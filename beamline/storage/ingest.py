@@ -22,7 +22,7 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import altered_said
+from beamline.storage.rules.validate import altered_said, stated_used
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.rows import Record, Rows
@@ -33,13 +33,17 @@ PER_FLUSH = 64  # rows
 
 @dataclass(frozen=True)
 class Ingested:
-    """What was written: `definition` says whether it is an NXtomo; `invalid_frames`: frames without a valid pixel."""
+    """What was written: `definition` says whether it is an NXtomo; `invalid_frames`: frames without a valid pixel.
+
+    `doubts`: what the input states that may change the volume, that is not used, and that the copy does not state.
+    """
 
     path: Path
     definition: str
     frames: int
     pixel_bytes: int
     invalid_frames: int
+    doubts: tuple[str, ...] = ()
 
 
 def ingest(
@@ -77,19 +81,30 @@ def ingest(
             )
         if source.altered:
             raise DataError(f"{altered_said(source)} Nothing was written.")
+        if source.row_pitch_mm is not None:
+            raise DataError(
+                f"{source.path} has pixels of {source.pixel_size_mm} x {source.row_pitch_mm:g} mm, and the copy states "
+                "one size. Reconstruct it as it is. Nothing was written."
+            )
+        distance = source.attributes.get("distance_mm")
+        if source.cone is not None:
+            distance = source.cone[1] - source.cone[0]
         info = layout.ScanInfo(
             sample=sample or str(source.attributes.get("sample", source.path.stem)),
             title=f"ingested from {source.path.name}",
             pixel_size_mm=pixel_size_mm or source.pixel_size_mm,
             energy_kev=energy_kev or source.energy_kev,
             axis_col=source.axis_col,
+            distance_mm=distance if isinstance(distance, int | float) else None,
+            source_distance_mm=None if source.cone is None else source.cone[0],
         )
         with hdf5.created(partial, layout.LIBVER) as file:
             invalid = _copy(source, file, out, info, no_data, progress)
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
-        return Ingested(out, definition, frames, size, invalid)
+        doubts = tuple(finding.message for finding in stated_used(source) if finding.severity != "info")
+        return Ingested(out, definition, frames, size, invalid, doubts)
 
 
 def _copy(

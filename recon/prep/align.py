@@ -8,7 +8,7 @@ sector, but needs the whole sample in the field and air at zero.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ from recon.prep.axis_search import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
+_FEWEST = 2  # columns at each edge that are too near to it for an axis
+_PAIRINGS = 32  # of views that are not opposite
+_PERFECT = 1 - 1e-9
+_ALL = slice(None)
 _EDGE = 25  # one column in so many, at each edge, is too near to it for an axis
 
 
@@ -61,25 +65,54 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
     """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
 
     As `axis_from_pair`, but from the views' slopes along the columns, which share no trend if the overlap is narrow.
-    The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
-    29, 17849).
+    What all views show alike, as the rim of a round sample, is taken off. The sum is over up to 64 pairs and over rows
+    (the overlap of wide-field scans: Vo et al. 2021, Opt. Express 29, 17849). Few columns agree by chance, so that a
+    candidate counts by Fisher's z = artanh(correlation) √columns. The estimate is confident if its z is above the
+    largest z that any candidate has among pairs that are no opposite views (each view with that of another pair), in
+    every of up to 32 such pairings: a false alarm in 33.
 
     Args:
         projections: float32 [view, row, col], line integrals.
         angles: [view], radians.
-        search: (lowest, highest) column; None: all but a 25th at each edge.
+        search: (lowest, highest) column; None: all but 2 at each edge.
 
     Raises:
         ValueError: fewer than 8 pairs of opposite views, or values that are not finite.
         AxisError: where the best match lies at the edge of the search range or outside it.
     """
     a, b = _opposites(projections, angles)
-    candidates = _opposite_candidates(projections.shape[2])
-    curve = _mirror_mismatch(_rows_of(a), _rows_of(b), candidates - 0.5)
-    value, depth = optimum(candidates, curve, search)
-    halves = [_mirror_mismatch(_rows_of(a[i::2]), _rows_of(b[i::2]), candidates - 0.5) for i in (0, 1)]
-    apart = max(abs(lowest(candidates, half)[0] - value) for half in halves)
-    return AxisEstimate(value, *within(search, candidates, curve), depth > 0.5 and apart < AGREE, "opposite views")
+    cols = projections.shape[2]
+    candidates = np.arange(2 * _FEWEST, 2 * (cols - 1 - _FEWEST) + 1) / 2
+    root = np.sqrt(np.minimum(2 * candidates, 2 * (cols - 1 - candidates)))
+
+    views = _Mirrored.of(_rows_of(a), _rows_of(b), candidates - 0.5)
+    pairs, height = a.shape[:2]
+
+    def score_of(curve: Floats) -> Floats:
+        return np.arctanh(np.clip(1 - curve, -_PERFECT, _PERFECT)) * root
+
+    curve = views.mismatch()
+    score = score_of(curve)
+    inside = np.ones(candidates.size, np.bool_)
+    if search is not None:
+        inside = (candidates >= search[0]) & (candidates <= search[1])
+    optimum(candidates, score.max() - score, search)  # refuses a range without the axis
+    best = int(np.flatnonzero(inside)[score[inside].argmax()])
+    value = _vertex(candidates, curve, best)
+    middle = pairs // 2 * height  # neighbouring views are alike, the two quarters of a turn are not
+    halves = [score_of(views.mismatch(part)) for part in (slice(middle), slice(middle, None))]
+    apart = max(abs(float(candidates[half.argmax()]) - value) for half in halves)
+    turned = np.unique(np.linspace(1, pairs - 1, min(pairs - 1, _PAIRINGS)).astype(int))
+    confident = apart < AGREE and all(
+        score[best] > score_of(views.mismatch(others=int(n) * height)).max() for n in turned
+    )
+    return AxisEstimate(value, *within(search, candidates, curve), confident, "opposite views")
+
+
+def _vertex(candidates: Floats, curve: Floats, best: int) -> float:
+    """Of the parabola through the curve at three candidates."""
+    near = slice(max(best - 1, 0), best + 2)
+    return lowest(candidates[near], curve[near])[0]
 
 
 def _opposite_candidates(cols: int) -> Floats:
@@ -88,19 +121,28 @@ def _opposite_candidates(cols: int) -> Floats:
 
 def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
     """Slopes along the columns [pair, row, col - 1] of some rows of views, and of opposite views, negated."""
-    theta, cols = np.mod(np.asarray(angles, np.float64), 2 * np.pi), projections.shape[2]
+    first, opposite = _opposite_pairs(np.asarray(angles, np.float64), projections.shape[2])
+    if first.size < _FEWEST_PAIRS:
+        raise ValueError(f"{first.size} pairs of views half a turn apart; {_FEWEST_PAIRS} are needed")
+    some = np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))
+    first, opposite = first[some], opposite[some]
+    data = few_rows(projections[np.concatenate((first, opposite))])
+    if not np.isfinite(data).all():
+        raise ValueError("the views hold NaN or infinite values; correct them first")
+    slopes = np.diff(uniform_filter1d(data, 3, axis=2), axis=2)
+    slopes -= slopes.mean(axis=0)
+    return slopes[: first.size], -slopes[first.size :]
+
+
+def _opposite_pairs(angles: Floats, cols: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Views of half a turn, by their angles, and those that are opposite to within 2 / cols."""
+    theta = np.mod(angles, 2 * np.pi)
     away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
     opposite = away.argmax(axis=1)
     exact = np.pi - away[np.arange(theta.size), opposite] < max(2 / cols, 1e-9)
     first = np.flatnonzero(exact & (theta < theta[opposite]))
-    if first.size < _FEWEST_PAIRS:
-        raise ValueError(f"{first.size} pairs of views half a turn apart; {_FEWEST_PAIRS} are needed")
-    first = first[np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))]
-    data = few_rows(projections[np.concatenate((first, opposite[first]))])
-    if not np.isfinite(data).all():
-        raise ValueError("the views hold NaN or infinite values; correct them first")
-    slopes = np.diff(uniform_filter1d(data, 3, axis=2), axis=2)
-    return slopes[: first.size], -slopes[first.size :]
+    first = first[np.argsort(theta[first], kind="stable")]
+    return first, opposite[first]
 
 
 def _rows_of(views: Floats) -> Floats:
@@ -112,22 +154,57 @@ def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
 
     It is 1 if these columns hold too little of the views' variance: air alone always matches.
     """
-    rows, cols = a.shape
-    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
-    total = (2 * candidates).astype(int)  # i + j of the pixels compared
-    n = fft.next_fast_len(2 * cols, real=True)
-    product = fft.irfft(fft.rfft(a, n) * fft.rfft(b, n), n)[:, total]
-    first, last = np.maximum(total - cols + 1, 0), np.minimum(total, cols - 1) + 1
+    return _Mirrored.of(a, b, candidates).mismatch()
 
-    def sums(x: Floats) -> Floats:
-        cumulative = np.concatenate([np.zeros((rows, 1)), np.cumsum(x, axis=1)], axis=1)
-        return cumulative[:, last] - cumulative[:, first]
 
-    count, sum_a, sum_b = last - first, sums(a), sums(b)
-    covariance = (product - sum_a * sum_b / count).sum(axis=0)
-    variance = (sums(a * a) - sum_a**2 / count).sum(axis=0) * (sums(b * b) - sum_b**2 / count).sum(axis=0)
-    usable = variance > 1e-6 * (a * a).sum() * (b * b).sum()
-    return np.where(usable, 1 - covariance / np.sqrt(np.where(usable, variance, 1)), 1)
+@dataclass(frozen=True, eq=False)
+class _Mirrored:
+    """Rows [row, col] of two sets of views, and what each adds to the correlation with the other, for each candidate.
+
+    Attributes:
+        total: i + j of the pixels compared. length: of the transforms. count: columns that both have.
+        spectra: of both sets [row, frequency]; sums, variances: of both sets over these columns [row, candidate].
+        powers: of both sets [row].
+    """
+
+    total: NDArray[np.int_]
+    length: int
+    count: NDArray[np.int_]
+    spectra: tuple[NDArray[np.complex128], NDArray[np.complex128]]
+    sums: tuple[Floats, Floats]
+    variances: tuple[Floats, Floats]
+    powers: tuple[Floats, Floats]
+
+    @classmethod
+    def of(cls, a: Floats, b: Floats, candidates: Floats) -> _Mirrored:
+        rows, cols = a.shape
+        sets = tuple(x - x.mean(axis=1, keepdims=True) for x in (a, b))
+        total = (2 * candidates).astype(int)
+        n = fft.next_fast_len(2 * cols, real=True)
+        first, last = np.maximum(total - cols + 1, 0), np.minimum(total, cols - 1) + 1
+
+        def sums(x: Floats) -> Floats:
+            cumulative = np.concatenate([np.zeros((rows, 1)), np.cumsum(x, axis=1)], axis=1)
+            return cumulative[:, last] - cumulative[:, first]
+
+        added = [sums(x) for x in sets]
+        variances = [sums(x * x) - of_x**2 / (last - first) for x, of_x in zip(sets, added, strict=True)]
+        one, other = sets
+        return cls(
+            total, n, last - first, (fft.rfft(one, n), fft.rfft(other, n)), (added[0], added[1]),
+            (variances[0], variances[1]), ((one * one).sum(axis=1), (other * other).sum(axis=1)),
+        )  # fmt: skip
+
+    def mismatch(self, rows: slice = _ALL, others: int = 0) -> Floats:
+        """The curve [candidate] of some rows; each of the first set with the row `others` before it in the second."""
+        (fa, fb), (sum_a, sum_b) = self.spectra, self.sums
+        if others:
+            fb, sum_b = np.roll(fb, others, axis=0), np.roll(sum_b, others, axis=0)
+        product = fft.irfft(np.einsum("rk,rk->k", fa[rows], fb[rows]), self.length)[self.total]
+        covariance = product - np.einsum("rk,rk->k", sum_a[rows], sum_b[rows]) / self.count
+        variance = self.variances[0][rows].sum(axis=0) * self.variances[1][rows].sum(axis=0)
+        usable = variance > 1e-6 * self.powers[0][rows].sum() * self.powers[1][rows].sum()
+        return np.where(usable, 1 - covariance / np.sqrt(np.where(usable, variance, 1)), 1)
 
 
 def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
@@ -174,8 +251,11 @@ def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search 
         if (from_opposites := _confident_opposites(projections, theta, search)) is not None:
             return from_opposites
         raise
-    if not from_all.confident and (from_opposites := _confident_opposites(projections, theta, search)) is not None:
-        return from_opposites
+    if not from_all.confident:
+        if (from_opposites := _confident_opposites(projections, theta, search)) is not None:
+            return from_opposites
+        if _has_opposites(theta, projections.shape[2]):
+            return from_all  # one pair tells less than all of them, which do not agree
     pair = _closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
         return from_all
@@ -188,6 +268,11 @@ def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search 
     if abs(from_all.value - from_pair.value) > AGREE:
         return replace(from_all, confident=False)
     return from_all if from_all.confident else from_pair
+
+
+def _has_opposites(theta: Floats, cols: int) -> bool:
+    """Whether there are enough pairs of opposite views for `axis_from_opposites`."""
+    return _opposite_pairs(theta, cols)[0].size >= _FEWEST_PAIRS
 
 
 def _confident_opposites(projections: NDArray[np.floating], theta: Floats, search: Search) -> AxisEstimate | None:

@@ -15,6 +15,7 @@ from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
+from recon.voxels.view_weights import seen_by
 
 LIMIT = 0.007
 """Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
@@ -56,7 +57,7 @@ def unexplained(
 
     Random signs of the views cancel structure, which all views share, and keep noise [our own; after the odd-even
     differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around the middle of matter
-    are used, one row if the detector has 700 columns or more.
+    (of views that climb, those that see most of it) are used, one row if the detector has 700 columns or more.
 
     Args:
         volume: on the slices of the detector rows, 1/mm.
@@ -72,6 +73,10 @@ def unexplained(
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
     middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
     first = min(max(middle - n // 2, 0), slices - n)
+    if geometry.climbs:  # few views see the slices in between
+        at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
+        seen = np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid")
+        first = int(seen.argmax())
     rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _MATTER * float(np.percentile(part.data, 99))

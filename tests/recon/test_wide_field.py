@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
 import recon
 from recon import CorrectionSettings, References
-from recon.prep.align import axis_from_opposites
+from recon.prep.align import AxisError, axis_from_opposites
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
@@ -77,6 +79,53 @@ def test_an_axis_near_an_edge_is_found(axis: float, rng: np.random.Generator) ->
     estimate = recon.find_axis(views, TURN)
     assert (estimate.method, estimate.confident) == ("opposite views", True)
     assert estimate.value == pytest.approx(axis, abs=0.1)
+
+
+def wide_field(overlap: float, photons: float, seed: int, cols: int = 120) -> tuple[np.ndarray, float]:
+    """Views [view, row, col] of a full turn whose axis leaves this share of the columns to both halves, and the axis.
+
+    The sample is round: every view shows its rim in the same columns.
+    """
+    rng = np.random.default_rng(seed)
+    axis = cols - 0.5 - overlap * cols / 2
+    axis = axis if seed % 2 else cols - 1 - axis
+    reach = 0.9 * max(axis, cols - 1 - axis)
+    bodies = [Cylinder(reach, 8.0, 0.5 / reach)]
+    for _ in range(40):
+        radius, where, at = rng.uniform(0.02, 0.12) * reach, rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.85) * reach
+        centre = (float(at * np.cos(where)), float(at * np.sin(where)), 0.0)
+        bodies.append(Cylinder(float(radius), 8.0, float(rng.choice([-0.4, 1.0, 1.5])) / reach, centre=centre))
+    sample, detector = Phantom.of(tuple(bodies)), Detector((2, cols), 1.0, axis, 0.5)
+    views = np.stack([sample.line_integrals(angle, detector) for angle in TURN])
+    light = rng.poisson(photons * np.exp(-views)).clip(0.5)
+    return -np.log(light / photons).astype(np.float32), axis
+
+
+@pytest.mark.parametrize("overlap", [0.05, 0.066, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("photons", [1e4, 3e5])
+def test_the_axis_of_a_half_acquisition_is_found_with_little_overlap(overlap: float, photons: float) -> None:
+    views, axis = wide_field(overlap, photons, round(100 * overlap))
+    estimate = recon.find_axis(views, TURN)
+    assert estimate.value == pytest.approx(axis, abs=0.3)
+    assert estimate.confident
+
+
+@pytest.mark.parametrize("overlap", [0.01, 0.02, 0.03, 0.05])
+@pytest.mark.parametrize("photons", [30.0, 300.0])
+def test_an_axis_that_is_called_certain_is_right(overlap: float, photons: float) -> None:
+    """Where noise or a lack of overlap hides the axis, what is found is not called certain."""
+    for seed in range(3):
+        views, axis = wide_field(overlap, photons, seed)
+        estimate = recon.find_axis(views, TURN)
+        assert not estimate.confident or abs(estimate.value - axis) < 1
+
+
+def test_views_that_share_nothing_but_the_rim_of_the_sample_show_no_axis() -> None:
+    views, _ = wide_field(0.1, 1e5, 1)
+    others = np.concatenate([wide_field(0.1, 1e5, seed)[0][:90] for seed in (5, 7)])
+    assert axis_from_opposites(views, TURN).confident
+    with suppress(AxisError):
+        assert not axis_from_opposites(others, TURN).confident
 
 
 def test_without_opposite_views_or_matter_there_is_no_estimate(lines: np.ndarray) -> None:

@@ -126,6 +126,8 @@ class Phase:
         from beamline.projections.selection import cone_of, pixel_size
         from recon.prep.phase import Paganin, length_of
 
+        if source.row_pitch_mm is not None:
+            raise ConfigError(f"--phase needs square pixels; {source.path} has others.")
         cone, pitch = cone_of(source, selection), pixel_size(source, selection)
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm

@@ -125,6 +125,7 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 
 _POSES = "give the shifts of views with --poses"
+_POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
 UPRIGHT = "the detector is taken to stand upright to the beam"
 _DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
 
@@ -190,11 +191,11 @@ NXTOMO: tuple[Field, ...] = (
     Field("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
     Field("detector/polar_angle", UPRIGHT, False, _true),
     Field("detector/azimuthal_angle", UPRIGHT, False, _true),
-    Field("detector/x_translation", _POSES, False, _moves),
-    Field("detector/y_translation", _POSES, False, _moves),
-    Field("sample/x_translation", f"{_POSES}, unless the stage moved the axis, too", False, _moves),
-    Field("sample/y_translation", f"{_POSES}, unless the stage moved the axis, too", False, _moves),
-    Field("sample/z_translation", _POSES, False, _moves),
+    Field("detector/x_translation", _POINTS, False, _moves),
+    Field("detector/y_translation", _POINTS, False, _moves),
+    Field("sample/x_translation", _POINTS, False, _moves),
+    Field("sample/y_translation", _POINTS, False, _moves),
+    Field("sample/z_translation", _POINTS, False, _moves),
     Field("sample/distance", "the sample is taken to be at the rotation axis", False),
     Field("sample/propagation_distance", "follows from the distances of source and detector", False),
     Field("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),

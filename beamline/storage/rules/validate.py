@@ -40,6 +40,7 @@ _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
+_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 SAMPLES = 4  # frames of a kind that are looked at
@@ -228,7 +229,8 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view.",
+            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view."
+            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Field
@@ -342,6 +343,34 @@ def test_pixels_that_are_not_square_are_told(tmp_path: Path, height: float) -> N
 
     assert said() == ["info"]
     assert said(*CONE) == ["error"]
+
+
+COPIED: dict[str, list[tuple[str, Any, str | None]]] = {
+    "a cone": [*CONE, ("instrument/beam/incident_energy", 25.0, "keV")],
+    "a distance": [("detector/distance", 0.2, "m")],
+    "mirrored": [("detector/x_flipped", True, None), ("detector/y_flipped", True, None)],
+}
+
+
+@pytest.mark.parametrize("changes", COPIED.values(), ids=COPIED.keys())
+def test_a_copy_of_ours_states_the_same(tmp_path: Path, changes: list[tuple[str, Any, str | None]]) -> None:
+    path = nxtomo(tmp_path / "s.nx", *changes)
+    assert ingest(path, tmp_path / "copy.h5").doubts == ()
+    with open_scan(path) as source, open_scan(tmp_path / "copy.h5") as copy:
+        for name in ("cone", "pixel_size_mm", "energy_kev", "row_pitch_mm"):
+            assert getattr(copy, name) == pytest.approx(getattr(source, name)), name
+        assert copy.attributes.get("distance_mm") == source.attributes.get("distance_mm")
+        np.testing.assert_array_equal(copy.read(slice(None)), source.read(slice(None)))
+
+
+def test_what_a_copy_cannot_state_is_refused_or_named(tmp_path: Path) -> None:
+    path = nxtomo(tmp_path / "s.nx", ("detector/y_pixel_size", 2.0, "um"))
+    with pytest.raises(DataError, match=r"pixels of 0\.001 x 0\.002 mm, and the copy states one size"):
+        ingest(path, tmp_path / "copy.h5")
+    assert not (tmp_path / "copy.h5").exists()
+    climbs = ("sample/z_translation", np.r_[0, 0, np.arange(VIEWS)] * 1e-6, "m")
+    (doubt,) = ingest(nxtomo(tmp_path / "t.nx", climbs), tmp_path / "copy.h5").doubts
+    assert "sample/z_translation, 0 to 4e-06 m, which is not used" in doubt
 
 
 def test_the_page_lists_every_field() -> None:

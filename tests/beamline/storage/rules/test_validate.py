@@ -304,6 +304,15 @@ class Nothing:
         pass
 
 
+def test_angles_that_count_the_frames_are_doubted(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("\n".join(map(str, range(90))))
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"] = np.ones((90, 4, 5), np.uint16)
+    hits = validate(SourceOptions(tmp_path / "s.h5", angles=tmp_path / "a.txt"))
+    (hit,) = [hit for hit in hits if hit.rule == "angle-spread"]
+    assert hit.severity == "warning" and "do they count the frames?" in hit.message
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     views=st.integers(6, 400),
