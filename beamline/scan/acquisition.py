@@ -217,18 +217,21 @@ class Acquisition:
             shutter.open()
             if cold:
                 self._warm_up()
-        if shutter.is_open() is (kind is FrameKind.DARK):
-            wanted, found = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
+        if wrong := _wrong_shutter(kind, shutter.is_open()):
             raise InstrumentError(
-                f"{shutter.name}: it is {found}, {kind.name.lower()}s need it {wanted}. Check its interlock. "
-                "What was taken before is in the file."
+                f"{shutter.name}: {wrong}. Check its interlock. What was taken before is in the file."
             )
 
     def _remembered_places(self, kind: FrameKind) -> dict[str, Callable[[], str]]:
         """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
-        devices = () if kind is FrameKind.DARK else (self._devices.sample, self._devices.filter)
-        every = (*devices, self._devices.monochromator) if devices else ()
-        return {device.name: device.remember_place() for device in every if isinstance(device, Rechecked)}
+        shutter, found = self._devices.shutter, dict[str, Callable[[], str]]()
+        if not shutter.by_hand:
+            # A scan that is stopped in a pause ends with a closed one.
+            found[shutter.name] = lambda: "" if self._stop.stopping else _wrong_shutter(kind, shutter.is_open())
+        for device in (self._devices.sample, self._devices.filter, self._devices.monochromator):
+            if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
+                found[device.name] = device.remember_place()
+        return found
 
     def _require_in_place(self, looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range) -> None:
         """InstrumentError if a device that was moved and then believed is no longer where it stood before a block."""
@@ -237,8 +240,8 @@ class Acquisition:
             raise InstrumentError(
                 f"{'; '.join(f'{name}: {said}' for name, said in moved.items())}. It was moved while "
                 f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken: which of "
-                "them show it elsewhere is not known, so none should be used. Look who moved it, bring it back, and "
-                "take the scan again. What was taken before is good."
+                "them show it elsewhere is not known, so none should be used. Look who or what moved it, bring it "
+                "back, and take the scan again. What was taken before is good."
             )
 
     def _warm_up(self) -> None:
@@ -338,6 +341,14 @@ class Acquisition:
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""
         return "".join(f" {text}" for done in self._done if not done.again and (text := _describe(done)))
+
+
+def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
+    """What is wrong with a shutter for this kind of frame; "" if it is as it must be."""
+    if is_open is not (kind is FrameKind.DARK):
+        return ""
+    wanted, found = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
+    return f"it is {found}, {kind.name.lower()}s need it {wanted}"
 
 
 def _state_of(block: Block) -> State:

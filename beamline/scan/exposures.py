@@ -177,6 +177,7 @@ class Exposures:
         accepted = self._camera.configure(
             CameraSettings(block.exposure, source, self._settings.roi, self._settings.binning, self._settings.readout)
         )
+        frames: Iterator[tuple[CameraFrame, int, float, bool]]
         if block.trains:
             frames = ((frame, trigger, angle, True) for frame, trigger, angle in self._fly(block, taken))
         else:

@@ -248,3 +248,17 @@ def test_a_motor_within_its_tolerance_of_a_place_is_there(stage: str, tmp_path: 
         result = run_scan(settings, tmp_path, instrument=instrument)
     with h5py.File(result.path) as file:
         assert file["entry/instrument/filter/type"].asstr()[()] == "none"
+
+
+@pytest.mark.parametrize(("at", "kind"), [(0, "darks"), (2, "flats"), (FIRST + 2, "projections")])
+def test_a_shutter_that_moves_by_itself_ends_the_scan(at: int, kind: str, tmp_path: Path) -> None:
+    settings = small(f"scan.angles={{scheme: fixed, views: {VIEWS}}}", *WORDS)
+    with devices.connect(settings) as instrument:
+        shutter = instrument.devices.shutter
+
+        def by_itself(controller: Any, clock: Clock, now: float) -> None:
+            shutter.open() if kind == "darks" else shutter.close()
+
+        used = nudged(instrument, by_itself, at, 1)
+        with pytest.raises(InstrumentError, match=rf"shutter: it is \w+, {kind} need it \w+\. It was moved while"):
+            run_scan(settings, tmp_path, instrument=used)
