@@ -22,11 +22,13 @@ from beamline.xafs.contrast import ContrastRegions, XafsCurve
 from beamline.xafs.radiographs import FramePart, Radiographs
 from beamline.xafs.scans import ScanRadiographs
 from beamline.xafs.series import Series
+from recon.base.units import look_like_transmission
 
 Reals = NDArray[np.float64]
 
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
+_LOOKED_AT = 8  # frames, for transmission given as line integrals
 _KEV = {"keV": 1.0, "eV": 1e-3}
 _MOST = 1e30  # absorption in any unit: more is a fault of the file, and squares of more are beyond floats
 
@@ -164,6 +166,12 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
             raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
         if quantity == "line_integrals":
             flats = None
+            some = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist()]
+            if look_like_transmission(np.asarray(some, np.float32)):
+                raise DataError(
+                    f"{path}: frames are about 1 at their edges and fall where the material is, as transmission does; "
+                    "line integrals rise there. Leave out --quantity, and add flats of 1 to the file."
+                )
         elif flats is None:
             raise DataError(
                 f"{path}: frames without flats may be counts or line integrals. Add flats, or give --quantity "

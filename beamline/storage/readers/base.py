@@ -248,7 +248,7 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
     """As `source.read`, with NaN (0 of whole numbers) for frames that the file does not give: see its `unreadable`."""
     try:
-        return source.read(frames, rows)
+        return source.read(frames) if rows == WHOLE else source.read(frames, rows)
     except UnreadableError:
         indices = frame_indices(frames, int(source.image_key.size))
     out = np.zeros((indices.size, len(range(source.shape[0])[rows]), source.shape[1]), source.dtype)

@@ -274,8 +274,8 @@ def quantity_said(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "quantity",
-            f"{said} whether pixels are counts, transmission or line integrals: say --quantity counts, transmission "
-            "or line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
+            f"{said} whether pixels are counts, transmission or line integrals: say --quantity counts, "
+            "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
         )
 
 

@@ -19,7 +19,7 @@ from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
-from beamline.storage.volumes.nxtomoproc import NXtomoproc
+from beamline.storage.volumes.nxtomoproc import NexusVolume, NXtomoproc
 from beamline.storage.volumes.plain import Npy
 from beamline.storage.volumes.registry import formats
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction, volumes_in_time
@@ -83,8 +83,9 @@ def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
 
 
 def volume_format(path: Path) -> VolumeFormat | None:
-    """The format of a volume that this program wrote, or of an .npy that is no scan; None for scans and all else."""
-    found = next((kind for kind in formats() if kind.holds(path)), None)
+    """The format of a volume that this program wrote, or of an .npy that is no scan, or of a NeXus file that plots one;
+    None for scans and all else."""
+    found = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
     # Voxels alone say nothing of where they come from: a reader of scans goes first.
     if isinstance(found, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
         return None

@@ -241,10 +241,10 @@ def test_messages_speak_of_options_as_they_are_typed(
 def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
     _bare(folder)
     said = _beamline(command, "stack.tif").stdout
-    assert "say --quantity counts or --quantity line-integrals." in said
+    assert "say --quantity counts, --quantity transmission or --quantity line-integrals." in said
     said = _beamline(command, "stack.tif", "--quantity", "counts").stdout
-    assert "Counts without flats: give --flats FILE (or a folder), or --quantity line-integrals" in said
-    assert "Counts without darks: give --darks FILE (or a folder), or --quantity line-integrals" in said
+    assert "Counts without flats: give --flats FILE (or a folder). If the frames were divided" in said
+    assert "Counts without darks: give --darks FILE (or a folder). If the frames were divided" in said
 
 
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:

@@ -9,7 +9,9 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.reconstruct.model import read_model, write_views
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from tests.beamline.cli.small_scan import beamline
 
@@ -109,3 +111,18 @@ def test_a_volume_without_gaussians_and_bad_names_are_refused(folder: Path) -> N
         result = beamline(*arguments)
         assert result.exit_code == code and said in result.stderr + str(result.exception), (arguments, result.output)
         assert not list(folder.glob("x.*"))
+
+
+def test_views_of_a_cone_state_their_cone_and_one_that_no_file_states_is_refused(folder: Path) -> None:
+    _made("recon", "scan.h5", *FIT, "-o", "v.h5")
+    model = read_model(folder / "v.h5")
+    cone = replace(model, geometry=replace(model.geometry, sod=100.0, sdd=250.0))
+    write_views(folder / "views.h5", cone, np.radians([0.0, 90.0]), lambda n, of: None)
+    with open_scan(folder / "views.h5") as source:
+        assert source.cone == pytest.approx((100.0, 250.0)) and source.quantity == "line_integrals"
+        assert source.pixel_size_mm == cone.geometry.pixel_pitch and source.axis_col == cone.geometry.axis_col
+        np.testing.assert_allclose(source.angles, np.radians([0.0, 90.0]))
+    off_middle = replace(cone, geometry=replace(cone.geometry, axis_row=7.0))
+    with pytest.raises(DataError, match="a scan file states cones in mm about the middle row"):
+        write_views(folder / "x.h5", off_middle, np.zeros(1), lambda n, of: None)
+    assert not list(folder.glob("x.*"))

@@ -197,7 +197,7 @@ def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
 
 def test_unknown_quantity_names_the_option(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data_white": None, "data_dark": None})
-    with pytest.raises(DataError, match=r"--quantity counts or --quantity line-integrals"):
+    with pytest.raises(DataError, match=r"--quantity counts, --quantity transmission or --quantity line-integrals"):
         _prepare(path, Selection())
 
 

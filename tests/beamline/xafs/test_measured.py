@@ -66,7 +66,7 @@ def test_an_absorption_that_nothing_has_is_refused(tmp_path: Path, value: str) -
 
 
 def test_a_table_in_another_encoding_is_refused_in_our_words(tmp_path: Path) -> None:
-    (tmp_path / "mu.csv").write_text("8.30 1\n8.31 2", encoding="utf-16")
+    (tmp_path / "mu.csv").write_text("# für µ\n8.30 1\n8.31 2", encoding="latin-1")
     with (
         pytest.raises(DataError, match=r"mu.csv cannot be read .*It is no UTF-8 text.*Save it as UTF-8") as refused,
         open_measured(tmp_path / "mu.csv", None, None),
@@ -268,3 +268,19 @@ def test_other_units_missing_files_and_text_are_refused(tmp_path: Path) -> None:
         open_series(_hdf5(tmp_path / "good.h5", **_counts()), FileOptions(region=(0, 7, 0, 8))),
     ):
         pass
+
+
+def test_transmission_is_not_taken_for_line_integrals(tmp_path: Path) -> None:
+    depth = np.zeros((11, 20, 32))
+    depth[:, 5:15, 10:22] = np.linspace(0.5, 1.5, 11)[:, None, None]
+    path = _hdf5(tmp_path / "t.h5", energy=ENERGIES, frames=np.exp(-depth).astype(np.float32))
+    with (
+        pytest.raises(DataError, match=r"as transmission does.* add flats of 1"),
+        open_measured(path, None, "line_integrals"),
+    ):
+        pass
+    with h5py.File(path, "r+") as file:
+        file["flats"] = np.ones((20, 32), np.float32)
+    with open_measured(path, None, None) as found:
+        lines = np.stack([frame for _, frame in found.line_integrals(range(11))])
+    np.testing.assert_allclose(lines, depth, atol=1e-5)

@@ -1,0 +1,170 @@
+"""Every file that a command writes is read by every command that claims to: all pairs of both.
+
+Series in time are read in test_recon_time.py.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.page.volume import ShownVolume
+from beamline.reconstruct.measure import read_truth
+from beamline.simulate.scene_file import volumes_beside
+from beamline.storage.volumes.files import opened_volume
+from tests.beamline.cli.small_scan import beamline
+from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
+
+SCENE = """
+phantom:
+  kind: solids
+  solids:
+    - {kind: ellipsoid, semi_axes: [0.1, 0.08, 0.06], attenuation: 4.0, centre: [0.05, 0.02, 0.0]}
+beam: {photons_per_s: 1.0e+5}
+detector: {shape: [12, 32], pixel_size_um: 12.0, exposure_s: 0.02}
+scan: {views: 14, darks: 2, flats: 2}
+effects: [photon_noise]
+"""
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 12.0)), shape=(10, 40), pixel_size_mm=0.5)
+WINDOW = ("--bits", "16", "--window", "-1:6")
+
+SCANS: dict[str, tuple[str, ...]] = {
+    "simulated.h5": ("simulate", "scene.yaml", "-o"),
+    "emission.h5": ("simulate", "pet", "--frames", "14", "-o"),
+    "ingested.h5": ("ingest", "exchange.h5"),
+    "archived.h5": ("archive", "recorded.h5", "-o"),
+    "rendered.h5": ("render", "fit.h5", "-o"),
+    "rendered_else.h5": ("render", "fit.h5", "--angles", "0:180:9", "-o"),
+}
+FLOATS: dict[str, tuple[str, ...]] = {
+    "fbp.h5": ("recon", "simulated.h5", "-m", "fbp", "--no-report", "-o"),
+    "fbp.tif": ("recon", "simulated.h5", "-m", "fbp", "--no-report", "-o"),
+    "fine.h5": ("voxelise", "fit.h5", "-o"),
+    "fine.nrrd": ("voxelise", "fit.h5", "-o"),
+    "truth.h5": ("simulate", "scene.yaml", "--truth"),
+    "copy.h5": ("export", "fbp.h5", "-o"),
+    "copy.tif": ("export", "fbp.h5", "-o"),
+    "copy.npy": ("export", "fbp.h5", "-o"),
+    "copy.nrrd": ("export", "fbp.h5", "-o"),
+    "copy.zarr": ("export", "fbp.h5", "-o"),
+    "copy": ("export", "fbp.h5", "-o"),
+}
+GREYS: dict[str, tuple[str, ...]] = {
+    "grey.tif": ("export", "fbp.h5", *WINDOW, "-o"),
+    "grey.npy": ("export", "fbp.h5", *WINDOW, "-o"),
+    "grey.nrrd": ("export", "fbp.h5", *WINDOW, "-o"),
+    "grey.zarr": ("export", "fbp.h5", *WINDOW, "-o"),
+    "grey": ("export", "fbp.h5", *WINDOW, "-o"),
+}
+LABELS = {"labels.h5": ("segment", "fbp.h5", "--crop", "none", "-o")}
+SERIES, FIT = (
+    "series.h5",
+    ("recon", "simulated.h5", "-m", "r2", "--steps", "20", "--gaussians", "60", "--no-report", "-o"),
+)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The current directory, with a file of each kind."""
+    folder, before = tmp_path_factory.mktemp("written"), Path.cwd()
+    os.chdir(folder)
+    try:
+        Path("scene.yaml").write_text(SCENE, encoding="utf-8")
+        write_exchange(folder / "exchange.h5", SCAN)
+        write_flagged(folder / "recorded.h5", frames_of(SCAN), {}, pixel_size_mm=SCAN.pixel_size_mm)
+        simulated = {"simulated.h5": SCANS["simulated.h5"], "fit.h5": FIT}
+        for name, command in {**simulated, **SCANS, **FLOATS, **GREYS, **LABELS}.items():
+            if not Path(name).exists():
+                done = beamline(*command, name)
+                assert done.exit_code == 0, (name, done.output)
+        yield folder
+    finally:
+        os.chdir(before)
+
+
+def _command(*words: str) -> Callable[[str, Path], None]:
+    """A command on a file; `OUT` in a word is a new name in the test's folder."""
+
+    def run(name: str, out: Path) -> None:
+        done = beamline(*(word.replace("FILE", name).replace("OUT", str(out / "out")) for word in words))
+        assert done.exit_code == 0, done.output
+
+    return run
+
+
+SCAN_READERS = {
+    "info": _command("info", "FILE"),
+    "validate": _command("validate", "FILE", "--deep"),
+    "monitor": _command("monitor", "FILE"),
+    "ingest": _command("ingest", "FILE", "OUT.h5"),
+    "archive": _command("archive", "FILE", "-o", "OUT.h5"),
+    "recon": _command("recon", "FILE", "-m", "fbp", "--no-report", "-o", "OUT.h5"),
+    "statistics": _command("info", "FILE", "--statistics"),
+}
+
+
+@pytest.mark.parametrize("reader", SCAN_READERS)
+@pytest.mark.parametrize("name", [*SCANS, "exchange.h5", "recorded.h5"])
+def test_scans(written: Path, tmp_path: Path, name: str, reader: str) -> None:
+    SCAN_READERS[reader](name, tmp_path)
+
+
+def _viewed(name: str, out: Path) -> None:
+    ShownVolume(Path(name)).close()
+
+
+def _as_truth(name: str, out: Path) -> None:
+    with opened_volume(Path("fbp.h5")) as record:
+        assert read_truth(name).shape == record.volume.grid.shape
+
+
+def _in_a_scene(name: str, out: Path) -> None:
+    stored = volumes_beside(Path.cwd())(name, None)
+    assert stored is not None
+
+
+VOLUME_READERS = {
+    "info": _command("info", "FILE"),
+    "validate": _command("validate", "FILE"),
+    "export": _command("export", "FILE", "-o", "OUT.nrrd"),
+    "surface": _command("surface", "FILE", "-o", "OUT.stl"),
+    "segment": _command("segment", "FILE", "--crop", "none", "--margin", "0", "-o", "OUT.h5"),
+    "view": _viewed,
+    "truth": _as_truth,
+    "scene": _in_a_scene,
+}
+
+
+@pytest.mark.parametrize("reader", VOLUME_READERS)
+@pytest.mark.parametrize("name", [*FLOATS, *(pytest.param(name, marks=pytest.mark.slow) for name in GREYS), *LABELS])
+def test_volumes(written: Path, tmp_path: Path, name: str, reader: str) -> None:
+    if name in GREYS and not name.endswith(".npy") and reader == "export":
+        pytest.skip("refused with its reason: grey values of a window are not the volume")
+    if name in LABELS and reader == "truth":
+        pytest.skip("labels are no truth")
+    VOLUME_READERS[reader](name, tmp_path)
+
+
+def test_the_voxel_of_every_copy_is_that_of_the_volume(written: Path) -> None:
+    with opened_volume(Path("fbp.h5")) as record:
+        grid = record.volume.grid
+    for name in (*FLOATS, *GREYS, *LABELS):
+        if name.startswith("fine") or name.endswith(".npy"):
+            continue
+        with opened_volume(Path(name)) as record:
+            assert record.volume.grid.spacing == pytest.approx(grid.spacing), name
+            assert record.volume.grid.centre == pytest.approx(grid.centre, abs=1e-9), name
+
+
+def test_views_of_a_model_give_its_volume_again(written: Path, tmp_path: Path) -> None:
+    """Nothing is stated on the way: quantity, axis and pixel size are in the file."""
+    done = beamline("recon", "rendered_else.h5", "-m", "fbp", "--no-report", "-o", str(tmp_path / "v.h5"))
+    assert done.exit_code == 0, done.output
+    with opened_volume(tmp_path / "v.h5") as again, opened_volume(Path("fine.h5")) as model:
+        assert again.length_unit == "mm" and again.volume.grid.spacing == pytest.approx(model.volume.grid.spacing)
+        pair = np.ravel(again.volume.data[:]), np.ravel(model.volume.data[:])
+        assert np.corrcoef(*pair)[0, 1] > 0.97
