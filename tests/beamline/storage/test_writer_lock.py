@@ -33,6 +33,6 @@ def test_a_writer_gets_its_lock_though_somebody_asks_whether_it_is_held(tmp_path
 def test_an_exclusive_lock_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "a").touch()
     lock = WriterLock(tmp_path / "a")
-    with pytest.raises(OSError):  # noqa: PT011 - of the system
+    with pytest.raises(OSError):
         WriterLock(tmp_path / "a", exclusive=True)
     lock.release()
