@@ -54,8 +54,8 @@ class Grouped(Repeatable):
         )  # fmt: skip
 
     def grouped(self) -> list[click.Option]:
-        """The command's own options."""
-        return [param for param in self.params if isinstance(param, click.Option)]
+        """The command's own options, without hidden ones."""
+        return [param for param in self.params if isinstance(param, click.Option) and not param.hidden]
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         return [*super().get_params(ctx), self._help_all]

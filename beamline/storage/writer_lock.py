@@ -12,6 +12,7 @@ import os
 import re
 import sys
 import tempfile
+import time
 import weakref
 from contextlib import suppress
 from enum import Enum
@@ -20,6 +21,8 @@ from pathlib import Path
 import h5py
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
+
+_TRIES, _PAUSE = 20, 0.005  # real s between tries for a shared lock
 
 if sys.platform == "win32":
     import msvcrt
@@ -117,12 +120,18 @@ class WriterLock:
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
         file = os.open(path, os.O_RDWR)
         self.release = weakref.finalize(self, os.close, file)
-        try:
-            _lock(file, exclusive=exclusive)
-        except OSError as error:
-            if exclusive and isinstance(error, BlockingIOError | PermissionError):
-                self.release()
-                raise
+        for left in reversed(range(_TRIES)):
+            try:
+                _lock(file, exclusive=exclusive)
+                return
+            except (BlockingIOError, PermissionError):
+                if exclusive:
+                    self.release()
+                    raise
+                if left:
+                    time.sleep(_PAUSE)  # `held` has the lock for a moment
+            except OSError:  # no locks on this disk
+                return
 
 
 def held(path: Path) -> bool:
