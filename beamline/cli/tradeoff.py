@@ -67,7 +67,8 @@ def listed(value: str) -> tuple[str, ...]:
 @click.option(
     "--max-seconds",
     type=POSITIVE,
-    help="Longest wall time of all trials together; the table then has the trials done by that time.",
+    help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
+    "would not fit is not begun.",
 )
 @heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")

@@ -147,10 +147,15 @@ class _Judging:
         return {**found, "seconds": seconds}
 
     def look_at_residual(self) -> Unexplained | None:
-        """Measure the volume, and what it leaves in the views."""
+        """Measure the volume, and what it leaves in the views: of a volume that was fitted to them.
+
+        A direct method leaves the blur of its filter in them, which tells nothing of what it hides.
+        """
         made, prepared, seed = self.made, self.prepared, self.context.seed
         views, rng = prepared.projections.data, np.random.default_rng(seed)
-        left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
+        left = None
+        if not self.direct:
+            left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
         before = self.clock.now()
         own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)

@@ -121,7 +121,8 @@ def _footnotes(
     if left is not None:
         footnotes.append(
             f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "
-            f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something."
+            f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something. It compares "
+            "fits of the same views: views that are displaced have more noise, so less exceeds it."
         )
     if "stray" in metrics[made.method]:
         footnotes.append(

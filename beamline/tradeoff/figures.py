@@ -36,10 +36,15 @@ def pareto_plot(
     figure = Figure(figsize=(_SIZE[0], _SIZE[1] + 0.18 * len(front)), dpi=_DPI, layout="constrained")
     axes: Axes = figure.subplots()
     shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
-    for trial, cost, quality in shown:
+    named = {id(points[i]) for i in front}
+    for point in points:
+        trial, cost, quality = point
+        if not (math.isfinite(cost) and math.isfinite(quality)):
+            continue
+        # The trials that numbers name lie above those at the same place.
         axes.scatter(
             cost, quality, s=_size(trial.group), marker=_MARKERS.get(trial.group, "o"),
-            color=colour_of(trial.method), edgecolors="white", linewidths=0.6, zorder=3,
+            color=colour_of(trial.method), edgecolors="white", linewidths=0.6, zorder=4 if id(point) in named else 3,
         )  # fmt: skip
     kept = [points[i] for i in front]
     axes.step([p[1] for p in kept], [p[2] for p in kept], where="post", color="black", lw=1.1, alpha=0.5, zorder=2)

@@ -21,15 +21,16 @@ def command(job: Path) -> Sequence[str]:
     return [sys.executable, "-m", "beamline.tradeoff.worker", str(job)]
 
 
-def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
+def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | None = None) -> None:
     """Fill the cache of compiled kernels for these trials, so that no trial's memory includes the compiler's.
 
     Args:
         work: a folder with data.npz.
+        max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
     """
     kinds = {_kernels(trial): trial for trial in trials}
     job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
-    _run(job, work)  # a failure here comes again in a trial, which reports it
+    _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
 
 
 def _kernels(trial: Trial) -> tuple[str, ...]:

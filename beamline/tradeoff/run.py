@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,10 +20,11 @@ from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.opened import ComparedScan, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Timed, seconds_left
+from beamline.tradeoff.trials import Outcome, Timed, seconds_left, telling_first
 from beamline.tradeoff.varied import Depth
 from drivers.base.clock import Clock
 
+_PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 _SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the page shows
 
 
@@ -33,7 +35,8 @@ class TradeoffOptions:
     Attributes:
         methods: names in `recon.methods`; none: those that suit such a scan.
         several: how the views show several volumes.
-        max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
+        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
+            what is left is not begun, a running one is ended. None: no limit.
     """
 
     scan: ComparedScan
@@ -57,9 +60,14 @@ def run_tradeoff(
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    folder, started = options.scan.folder, clock.now()
+    folder, started, begin = options.scan.folder, clock.now(), now()
+    end = math.inf
+    if options.max_seconds is not None:
+        end = begin + options.max_seconds - min(_PAGES[0], _PAGES[1] * options.max_seconds)
     found = compared(options.scan, options.methods, options.depth, options.several, Warnings(sink, clock))
     data, trials = found.data, found.trials
+    if options.max_seconds is not None:
+        trials = telling_first(trials)
     table = TrialTable(
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
         by="psnr" if data.truth is not None else "residual_held_out",
@@ -76,8 +84,8 @@ def run_tradeoff(
     with result_folder(folder) as work:
         data.save(work / "data.npz")
         sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
-        compile_kernels(trials, work)
-        table = until_stopped(table, _each(table, work, slices, options, sink, clock, now), folder, write_table)
+        compile_kernels(trials, work, None if end == math.inf else max(end - now(), 0.0))
+        table = until_stopped(table, _each(table, work, slices, options, sink, clock, now, end), folder, write_table)
     write_figures(folder, table, slices)
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
     sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
@@ -92,15 +100,25 @@ def _each(
     sink: Sink,
     clock: Clock,
     now: Callable[[], float],
+    end: float,
 ) -> Iterator[TrialTable]:
-    """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets the slices of the baselines."""
+    """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets the slices of the baselines.
+
+    `end`: by `now`, when the last trial must be done; inf: no limit.
+    """
     begin = now()
     timed: list[Timed] = []
     for index, outcome in enumerate(table.outcomes):
         trial = outcome.trial
-        left = None if options.max_seconds is None else options.max_seconds - (now() - begin)
+        left = None if end == math.inf else end - now()
         if left is not None and left <= 0:
             break
+        needed = seconds_left(timed, [trial])
+        if left is not None and needed is not None and needed > left:
+            message = f"not begun: it would take about {needed:.0f} s, of which {left:.0f} s were left"
+            table = table.with_outcome(index, replace(outcome, message=message))
+            yield table
+            continue
         eta = seconds_left(timed, [other.trial for other in table.outcomes[index:]])
         n, rate = len(table.outcomes), 60 * index / max(now() - begin, 1e-9)
         sink(TrialReached("tradeoff", index, n, trial.label, eta, rate, time=clock.now()))

@@ -167,6 +167,17 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
 
 
+def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """The trials in an order for little time: each method once, direct ones first, without half-set resolutions.
+
+    These take two more reconstructions each, and say less than one of another method.
+    """
+    once = [replace(trial, halves=False) for trial in trials]
+    alone = [trial for trial in once if trial.group == "method"]
+    direct = [trial for trial in alone if by_name(trial.method).traits.direct]
+    return tuple(dict.fromkeys([*direct, *alone, *once]))
+
+
 def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
     """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
     alone = _baselines(methods, n_views, gaussians)

@@ -74,3 +74,12 @@ def test_a_curve_is_dashed_where_its_views_were_used(drawn: list[Figure]) -> Non
     assert (solid.get_linestyle(), dashed.get_linestyle()) == ("-", "--")
     names = [label.get_text() for label in drawn[0].legends[0].get_texts()]
     assert names == ["r2 (views held out)", "fbp (views used)"]
+
+
+def test_the_trial_that_a_number_names_lies_above_another_at_its_place(drawn: list[Figure]) -> None:
+    """Whichever of them was drawn later."""
+    points = [(FIT, 2.0, 25.0), (FBP, 2.0, 25.0), (FEW, 2.0, 25.0)]
+    for front in range(3):
+        pareto_plot(points, [front], "time (s)", "PSNR (dB)")
+        dots = drawn[-1].axes[0].collections[:3]
+        assert max(range(3), key=lambda k: dots[k].get_zorder()) == front

@@ -238,6 +238,39 @@ def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any)
     assert all(0 < left <= 60 for left in limits) and limits == sorted(limits, reverse=True)
 
 
+def test_a_limit_of_time_bounds_reading_compiling_and_the_page(
+    tmp_path: Path, made_up: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a clock on which reading takes 20 s, compiling 10 s and each trial a time that goes with its work."""
+    at = 0.0
+
+    def passing(seconds: float, then: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            nonlocal at
+            at += seconds
+            return then(*args, **kwargs)
+
+        return run
+
+    def trial(one: Trial, work: Path, seed: int, left: float, keep: Path | None) -> Outcome:
+        nonlocal at
+        outcome = _made_up(one, keep=keep)
+        taken = outcome.seconds * (3 if one.halves else 1)
+        at += min(2 + taken, left)
+        return outcome if 2 + taken <= left else Outcome(one, "out of time")
+
+    monkeypatch.setattr(tradeoff, "compared", passing(20.0, tradeoff.compared))
+    monkeypatch.setattr(tradeoff, "compile_kernels", passing(10.0, lambda *_: None))
+    made_up(trial)
+    table = run_tradeoff(_options(tmp_path, max_seconds=55.0), lambda e: None, SystemClock(), lambda: at)
+    assert at <= 50.0
+    done = [outcome.trial for outcome in table.compared]
+    assert [each.method for each in done[:2]] == ["fbp", "r2"]  # each method once, the direct one first
+    assert not any(each.halves for each in done)
+    left_out = [outcome for outcome in table.outcomes if outcome.status == "not run" and outcome.message]
+    assert left_out and all("not begun: it would take about" in outcome.message for outcome in left_out)
+
+
 def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:
     def failing(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         return Outcome(trial, "failed", message="no room") if trial.method == "fbp" else _made_up(trial)
