@@ -44,6 +44,7 @@ LEAST_NOISE = 2e-3  # line integral: flats and the steps of the stage are not be
 LIT = 1e-3  # weight of a cell that has as good as no light
 FINE = 0.5  # cells between the places tried for either end of a track
 REACH = 6.0  # cells that a rival may be beside the newest place
+UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
 LONGER = 1.5  # times as many steps in each round of a fit
 
 
@@ -102,7 +103,7 @@ class Sample(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A way through the field that ends in an octave's newest step.
+    """A way through the field that ends in one of an octave's newest steps.
 
     Attributes:
         score: sum of the changes along it, in standard deviations of that sum.
@@ -206,13 +207,20 @@ def _track(octave: Octave, row: int, col: float, speed: float, sample: Sample, l
     score, x, v, n, turn = max(fits)
     if score <= least:
         return None
-    kept = slice(0, int(n))
-    rival = max(_rival(change[kept], noise[kept], times[kept], x, sample.turn, axis, sample.radius) for axis in sample.axes)
-    cols = np.array([_place(x, v, time, turn, middle) for time in times[kept]])
-    return Track(score, rival, _uneven(change[kept], noise[kept], cols), row, cols, octave.steps[kept])
+    cols = np.array([_place(x, v, time, turn, middle) for time in times[: int(n)]])
+    kept = slice(_ended(change, noise, cols), int(n))
+    part = change[kept], noise[kept], times[kept]
+    rival = max(_rival(*part, float(cols[kept][0]), sample.turn, axis, sample.radius) for axis in sample.axes)
+    return Track(score, rival, _uneven(*part[:2], cols[kept]), row, cols[kept], octave.steps[kept])
 
 
-UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
+def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> int:
+    """Newest steps without which the score is largest: the crumb has gone. More than SEED are left."""
+    at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
+    weight = noise[at].astype(float) ** -2
+    evidence = np.minimum(change[at] / noise[at], CLIP) * np.sqrt(weight)
+    scores = evidence[::-1].cumsum()[::-1] / np.sqrt(weight[::-1].cumsum()[::-1])
+    return int(np.argmax(scores[: max(cols.size - SEED, 1)]))
 
 
 def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
@@ -410,7 +418,7 @@ def _grow(change, noise, times, seed, motion, fit):
 def _rival(change, noise, times, newest, turn, axis, radius):
     """The largest score, over all these steps, of a point that turns within the radius and is near `newest` at last."""
     cols, best = change.shape[1], 0.0
-    span = times[-1]
+    span = times[-1] - times[0]
     for i in range(int(2 * REACH / FINE) + 1):
         x = newest - REACH + FINE * i
         room = radius * radius - (x - axis) * (x - axis)
@@ -421,7 +429,7 @@ def _rival(change, noise, times, newest, turn, axis, radius):
         for j in range(-n, n + 1):
             total, weight = 0.0, 0.0
             for k in range(times.size):
-                c = int(np.floor(_place(x, fastest * j / n, times[k], turn, axis) + 0.5))
+                c = int(np.floor(_place(x, fastest * j / n, times[k] - times[0], turn, axis) + 0.5))
                 if c >= 0 and c < cols:
                     s = noise[k, c]
                     total += min(change[k, c] / s, CLIP) / s
