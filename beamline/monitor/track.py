@@ -135,9 +135,12 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
     if octave.views == 1:
         mean = waiting[0]
     else:
-        parts = [np.mean([view[i] for view in waiting], axis=0, dtype=np.float32) for i in (2, 3)]
-        middle = 0.5 * (waiting[0].time + time)
-        mean = Mean((waiting[0].rows[0], row), middle, parts[0], parts[1])
+        mean = Mean(
+            (waiting[0].rows[0], row),
+            0.5 * (waiting[0].time + time),
+            np.mean(np.stack([view.depth for view in waiting]), axis=0),
+            np.mean(np.stack([view.weight for view in waiting]), axis=0),
+        )
     if len(octave.means) < 2:
         return replace(octave, waiting=(), means=(*octave.means, mean))
     before, own = octave.means
@@ -189,7 +192,9 @@ def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
     _highest(newest, offsets, best)
     n = _seeds(newest, offsets, np.float32(PROMISING), best, seeds)
     highest = seeds[:n][np.argsort(-seeds[:n, 3])[:MOST_SEEDS]]
-    found = [_track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest]
+    found = [
+        _track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest
+    ]
     return sorted((track for track in found if track is not None), key=lambda track: -track.score)
 
 

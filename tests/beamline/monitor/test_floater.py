@@ -84,7 +84,9 @@ def test_its_speed_direction_and_rows_are_said(sign: int) -> None:
 def test_a_crumb_on_the_holder_is_found_from_one_and_a_half_half_fields_on(away: float) -> None:
     """It turns with the stage: 1.1 to 3 times as fast as the rim of the sample."""
     radius = away * COLS / 2
-    scan = Blobs(500, depth=lambda view, image: image + blob(12, 63.5 + radius * np.sin((view - 250) * STEP), 1.0, 0.05))
+    scan = Blobs(
+        500, depth=lambda view, image: image + blob(12, 63.5 + radius * np.sin((view - 250) * STEP), 1.0, 0.05)
+    )
     flags = only(scan)
     assert flags
     for flag in flags:

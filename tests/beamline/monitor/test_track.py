@@ -54,7 +54,7 @@ def test_the_score_grows_as_the_root_of_the_views(speed: float) -> None:
         at: NDArray[np.float64] = (cols - (64 + speed * (view - 22))) ** 2
         image = 1 + 0.02 * np.exp(-0.5 * ((rows - 16) ** 2 + at) / 0.8**2) + rng.normal(0, 0.006, SHAPE)
         state = with_view(state, view, float(view), image.astype(np.float32), weight)
-        tracks += [track for track in tracks_of(state, SAMPLE, 6.0)][:1]
+        tracks += tracks_of(state, SAMPLE, 6.0)[:1]
     lengths = [len(track.steps) for track in tracks]
     assert max(lengths) <= MEMORY and max(lengths) > 1.5 * min(lengths)
     ratios = [track.score / np.sqrt(len(track.steps)) for track in tracks]

@@ -59,7 +59,7 @@ def test_a_clean_scan_has_no_flags(shared_data: Path) -> None:
 
 
 def test_diamond_has_facts_and_the_crumb_that_crosses_it(shared_data: Path) -> None:
-    """Rows 100 to 104, views 39 to 61 (frames 41 to 63), 7 px a view to the right; a view less its neighbours shows it."""
+    """Rows 100 to 104, frames 41 to 63, 7 px a view to the right, as a view less its neighbours shows."""
     found = flags(shared_data / DIAMOND)
     facts = {flag.check: flag for flag in found if flag.level is Level.INFO}
     assert facts.keys() == {"beam", "pixels", "field"}
@@ -116,7 +116,7 @@ def test_a_view_that_the_volume_does_not_explain_is_flagged_with_its_place(share
             assert flag.region is not None
             top, below, first, last = flag.region
             assert top <= 60 < below and first <= 100 < last and (below - top) * (last - first) <= 32 * 32
-    found = CliRunner().invoke(main, ["monitor", str(shared_data / DIAMOND), "--volume", str(tmp_path / "v.h5")])
-    assert found.exit_code == 0, found.output
+    said = CliRunner().invoke(main, ["monitor", str(shared_data / DIAMOND), "--volume", str(tmp_path / "v.h5")])
+    assert said.exit_code == 0, said.output
     with pytest.raises(DataError, match="need 2"), open_scan(shared_data / TOOTH) as other:
         rendered(tmp_path / "v.h5", other)
