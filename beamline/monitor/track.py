@@ -3,7 +3,8 @@
 Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
 along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
 of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is
-largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave* each.
+largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave*
+each.
 
 A track is none of the sample's if no point that turns with the stage within the sample's radius explains it: the
 difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
@@ -166,8 +167,8 @@ def _change(before: CellValues, own: CellValues, after: CellValues, weight: Cell
 def _noise(
     change: CellValues, weight: CellValues, noise: float, usual: CellValues | None, newest: float
 ) -> tuple[CellValues, CellValues]:
-    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass deviate
-    usually, there and beside."""
+    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass
+    deviate usually, there and beside."""
     if usual is None:
         usual = scipy.ndimage.uniform_filter(change**2, 5, mode="nearest")
         usual = np.maximum(usual, np.float32(noise**2) / np.maximum(weight, np.float32(LIT)))

