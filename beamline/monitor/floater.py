@@ -27,6 +27,7 @@ EVEN = 0.5  # of a step: the next view comes as many steps, or up to MOST_STEPS,
 COARSEST = math.radians(20)  # a view: more is no motion that could be followed
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
 MARGIN = 1.1  # the sample may be a little wider than the field
+CONE = 1.4  # likewise; nearer to the source it moves faster, by 1.3 at half a cone angle of 15 degrees
 OFF_MIDDLE = 0.05  # of the field: where the axis may be if it is not stated
 UNLIKELY = 36.0  # least difference of the squares of score and rival: 6 standard deviations, beyond what a search finds
 RIVAL = 0.85  # of the score, at most: both grow with the depth, and so does what either misses
@@ -151,7 +152,8 @@ def _sample(grid: CellGrid, context: ScanContext, step: float) -> Sample:
         axes: tuple[float, ...] = (middle - OFF_MIDDLE * cols, middle, middle + OFF_MIDDLE * cols)
     else:
         axes = ((context.axis_col + 0.5) / grid.cell - 0.5,)
-    return Sample(step, axes, cols / 2 * (WIDER if context.truncated else MARGIN))
+    wide = WIDER if context.truncated else CONE if context.cone else MARGIN
+    return Sample(step, axes, cols / 2 * wide)
 
 
 def _is_crumb(track: Track) -> bool:

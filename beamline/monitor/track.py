@@ -3,7 +3,8 @@
 Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
 along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
 of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is
-largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave* each.
+largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave*
+each.
 
 A track is none of the sample's if no point that turns with the stage within the sample's radius explains it: the
 difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
@@ -24,15 +25,18 @@ from beamline.core.jit import njit
 from beamline.monitor.view import CellValues
 
 SEED = 4  # steps of an octave whose sum shows where a track may go on
-SLOWEST = 2.5  # cells a step: what moves less is mostly taken off with the neighbours
-APART = 0.75  # cells a step between the speeds tried: the end of a seed is off by one cell at most
+SLOWEST, SLOW = 1.5, 4.0  # cells a step: what moves less is mostly taken off with the neighbours; more, in views of one
+APART = 0.5  # cells a step between the speeds tried: the end of a seed is off by less than a cell
 MEMORY = 48  # steps: SLOWEST crosses 120 cells in them
 PROMISING = 4.0  # standard deviations of a seed: of noise a few in a view
 MOST_SEEDS = 8  # of a step, the highest: more take time, and are noise, or a sample that jumped
 CLIP = 5.0  # standard deviations that one step may add
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
-KERNEL = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2).astype(np.float32)
-KERNEL_ROWS = KERNEL[2:5]
+KERNEL = np.exp(-0.5 * (np.arange(-2, 3) / SIZE) ** 2).astype(np.float32)
+KERNEL /= np.sqrt((KERNEL**2).sum())  # white noise keeps its variance
+KERNEL_ROWS = KERNEL[1:4] / np.sqrt((KERNEL[1:4] ** 2).sum())
+ONE = np.ones(1, np.float32)
+SAMPLED = 3  # cells, of which one is enough for the noise
 SPIKE = 6.0  # standard deviations between the neighbours: the brighter one has a zinger, or an edge passes
 COMMON = 8  # cells of a row or column that give its common change
 OUTLIER = 3.0  # standard deviations that a cell may add to the common change of its row, and to its usual deviation
@@ -41,6 +45,7 @@ LEAST_NOISE = 2e-3  # line integral: flats and the steps of the stage are not be
 LIT = 1e-3  # weight of a cell that has as good as no light
 FINE = 0.5  # cells between the places tried for either end of a track
 REACH = 6.0  # cells that a rival may be beside the newest place
+UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
 LONGER = 1.5  # times as many steps in each round of a fit
 
 
@@ -99,7 +104,7 @@ class Sample(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A way through the field that ends in an octave's newest step.
+    """A way through the field that ends in one of an octave's newest steps.
 
     Attributes:
         score: sum of the changes along it, in standard deviations of that sum.
@@ -131,57 +136,46 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
     if octave.views == 1:
         mean = waiting[0]
     else:
-        parts = [np.mean([view[i] for view in waiting], axis=0, dtype=np.float32) for i in (2, 3)]
-        middle = 0.5 * (waiting[0].time + time)
-        mean = Mean((waiting[0].rows[0], row), middle, parts[0], parts[1])
+        mean = Mean(
+            (waiting[0].rows[0], row),
+            0.5 * (waiting[0].time + time),
+            np.mean(np.stack([view.depth for view in waiting]), axis=0),
+            np.mean(np.stack([view.weight for view in waiting]), axis=0),
+        )
     if len(octave.means) < 2:
         return replace(octave, waiting=(), means=(*octave.means, mean))
     before, own = octave.means
     change, least = _change(before.depth, own.depth, mean.depth, own.weight)
-    noise, usual = _noise(change, least, octave.usual, max(FORGET, 1 / (octave.n + 1)))
+    noise, usual = _noise(change, own.weight, least, octave.usual, max(FORGET, 1 / (octave.n + 1)))
     steps = (Step(own.rows, own.time, change, noise), *octave.steps)[:MEMORY]
     return Octave(octave.views, (), (own, mean), steps, octave.n + 1, usual)
 
 
-def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, CellValues]:
-    """What the neighbours do not explain, smoothed, without what rows and columns have in common; and the variance of
-    its noise."""
-    change, root = np.empty_like(own), np.sqrt(weight)
-    _second(before, own, after, weight, np.float32(np.inf), change)
-    lit = (change * root)[weight > LIT][::3]
-    noise = max(1.4826 * float(np.median(np.abs(lit))) if lit.size else 1.0, LEAST_NOISE)
-    _second(before, own, after, weight, np.float32((SPIKE * noise) ** 2), change)
-    bounded = np.clip(change * root, -OUTLIER * noise, OUTLIER * noise) * root
-    for axis in (0, 1):
-        if change.shape[axis] >= COMMON:
-            common = bounded.sum(axis=axis, keepdims=True) / np.maximum(weight.sum(axis=axis, keepdims=True), LIT)
-            change -= common
-            bounded -= common * weight
-    change[weight <= LIT] = 0
-    change = _smooth(change, KERNEL, 1)
-    if change.shape[0] >= KERNEL_ROWS.size:
-        change = _smooth(change, KERNEL_ROWS, 0)
-    return change, np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
-
-
-def _smooth(values: CellValues, kernel: CellValues, axis: int) -> CellValues:
-    """White noise keeps its variance."""
-    return scipy.ndimage.convolve1d(values, kernel / np.sqrt((kernel**2).sum()), axis=axis, mode="constant")
+def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, float]:
+    """What the neighbours do not explain, without what rows and columns have in common, smoothed; and the standard
+    deviation of its noise in a cell of weight 1."""
+    change, smooth = np.empty_like(own), np.empty_like(own)
+    sample = np.empty(own.size // SAMPLED + own.shape[0], np.float32)
+    n = _second(before, own, after, weight, np.float32(np.inf), change, sample)
+    noise = max(1.4826 * float(np.median(sample[:n])) if n else 1.0, LEAST_NOISE)
+    _second(before, own, after, weight, np.float32((SPIKE * noise) ** 2), change, sample)
+    _take_common(change, weight, np.float32(OUTLIER * noise), COMMON)
+    _smooth(change, KERNEL, KERNEL_ROWS if own.shape[0] >= KERNEL_ROWS.size else ONE, smooth)
+    return smooth, noise
 
 
 def _noise(
-    change: CellValues, least: CellValues, usual: CellValues | None, newest: float
+    change: CellValues, weight: CellValues, noise: float, usual: CellValues | None, newest: float
 ) -> tuple[CellValues, CellValues]:
-    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass deviate
-    usually, there and beside."""
-    square = change**2
+    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass
+    deviate usually, there and beside."""
     if usual is None:
-        usual = np.maximum(least, scipy.ndimage.uniform_filter(square, 5, mode="nearest"))
-    else:
-        usual = usual + np.float32(newest) * (np.minimum(square, np.float32(OUTLIER**2) * usual) - usual)
-    around = scipy.ndimage.uniform_filter(usual, 3, mode="nearest")
-    highest = scipy.ndimage.maximum_filter1d(np.maximum(around, usual), 3, axis=1)
-    return np.sqrt(np.maximum(highest, np.float32(0.25) * least)), usual
+        usual = scipy.ndimage.uniform_filter(change**2, 5, mode="nearest")
+        usual = np.maximum(usual, np.float32(noise**2) / np.maximum(weight, np.float32(LIT)))
+        newest = 0.0
+    after, deviation = np.empty_like(usual), np.empty_like(usual)
+    _usual(change, weight, np.float32(noise**2), usual, np.float32(newest), after, deviation)
+    return deviation, after
 
 
 def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
@@ -190,14 +184,18 @@ def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
         return []
     newest = np.stack([step.change / step.noise for step in octave.steps[:SEED]])
     rows, cols = newest.shape[1:]
-    fastest = 2 * SLOWEST if octave.views > 1 else max(cols / SEED, 2 * SLOWEST)
+    fastest = SLOW if octave.views > 1 else max(cols / SEED, SLOW)
     speeds = np.arange(SLOWEST, fastest + APART, APART)
     speeds = np.concatenate([speeds, -speeds])
     offsets = np.rint(speeds[:, None] * np.arange(SEED)).astype(np.int64)
-    best, which, seeds = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.int32), np.empty((512, 4))
-    n = _seeds(np.minimum(newest, np.float32(CLIP)), offsets, np.float32(PROMISING), best, which, seeds)
+    best, seeds = np.empty((rows, cols), np.float32), np.empty((512, 4))
+    newest = np.minimum(newest, np.float32(CLIP))
+    _highest(newest, offsets, best)
+    n = _seeds(newest, offsets, np.float32(PROMISING), best, seeds)
     highest = seeds[:n][np.argsort(-seeds[:n, 3])[:MOST_SEEDS]]
-    found = [_track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest]
+    found = [
+        _track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest
+    ]
     return sorted((track for track in found if track is not None), key=lambda track: -track.score)
 
 
@@ -215,13 +213,20 @@ def _track(octave: Octave, row: int, col: float, speed: float, sample: Sample, l
     score, x, v, n, turn = max(fits)
     if score <= least:
         return None
-    kept = slice(0, int(n))
-    rival = max(_rival(change[kept], noise[kept], times[kept], x, sample.turn, axis, sample.radius) for axis in sample.axes)
-    cols = np.array([_place(x, v, time, turn, middle) for time in times[kept]])
-    return Track(score, rival, _uneven(change[kept], noise[kept], cols), row, cols, octave.steps[kept])
+    cols = np.array([_place(x, v, time, turn, middle) for time in times[: int(n)]])
+    kept = slice(_ended(change, noise, cols), int(n))
+    part = change[kept], noise[kept], times[kept]
+    rival = max(_rival(*part, float(cols[kept][0]), sample.turn, axis, sample.radius) for axis in sample.axes)
+    return Track(score, rival, _uneven(*part[:2], cols[kept]), row, cols[kept], octave.steps[kept])
 
 
-UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
+def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> int:
+    """Newest steps without which the score is largest: the crumb has gone. More than SEED are left."""
+    at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
+    weight = noise[at].astype(float) ** -2
+    evidence = np.minimum(change[at] / noise[at], CLIP) * np.sqrt(weight)
+    scores = evidence[::-1].cumsum()[::-1] / np.sqrt(weight[::-1].cumsum()[::-1])
+    return int(np.argmax(scores[: max(cols.size - SEED, 1)]))
 
 
 def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
@@ -233,33 +238,116 @@ def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) ->
 
 
 @njit(nogil=True, cache=True)
-def _second(before, own, after, weight, spike, change):
+def _second(before, own, after, weight, spike, change, sample):
     """Fills `change`: own less the mean of the neighbours, or less the darker one where their squares of the difference
-    are above `spike` over the weight."""
+    are above `spike` over the weight. `sample` gets deviations of cells with light: their number."""
+    n = 0
     for row in range(own.shape[0]):
+        one, two, three, w, out = before[row], own[row], after[row], weight[row], change[row]
         for col in range(own.shape[1]):
-            a, b = before[row, col], after[row, col]
-            if (a - b) * (a - b) * weight[row, col] > spike:
-                change[row, col] = own[row, col] - max(a, b)
-            else:
-                change[row, col] = own[row, col] - np.float32(0.5) * (a + b)
+            apart = one[col] - three[col]
+            reference = np.float32(0.5) * (one[col] + three[col])
+            reference += np.float32(0.5) * abs(apart) * np.float32(apart * apart * w[col] > spike)
+            out[col] = (two[col] - reference) * np.float32(w[col] > np.float32(LIT))
+        for col in range(row % SAMPLED, own.shape[1], SAMPLED):
+            if w[col] > np.float32(LIT):
+                sample[n] = abs(out[col]) * np.sqrt(w[col])
+                n += 1
+    return n
 
 
 @njit(nogil=True, cache=True)
-def _seeds(steps, offsets, least, best, which, seeds):
-    """Fills `seeds` with (row, col, speed's number, score) of the local maxima above `least`: their number."""
+def _take_common(change, weight, most, least):
+    """Takes off the mean of each column, then of each row, of changes up to `most` standard deviations; where there are
+    `least` cells."""
+    rows, cols = change.shape
+    if rows >= least:
+        total, light = np.zeros(cols, np.float32), np.full(cols, np.float32(LIT))
+        for row in range(rows):
+            for col in range(cols):
+                root = np.sqrt(weight[row, col])
+                total[col] += min(max(change[row, col] * root, -most), most) * root
+                light[col] += weight[row, col]
+        for row in range(rows):
+            for col in range(cols):
+                change[row, col] -= total[col] / light[col] * np.float32(weight[row, col] > np.float32(LIT))
+    if cols >= least:
+        for row in range(rows):
+            total_row, light_row = np.float32(0), np.float32(LIT)
+            for col in range(cols):
+                root = np.sqrt(weight[row, col])
+                total_row += min(max(change[row, col] * root, -most), most) * root
+                light_row += weight[row, col]
+            for col in range(cols):
+                change[row, col] -= total_row / light_row * np.float32(weight[row, col] > np.float32(LIT))
+
+
+@njit(nogil=True, cache=True)
+def _smooth(change, across, down, out):
+    """Correlated with a kernel along the columns and one along the rows; 0 beyond the edges."""
+    rows, cols = change.shape
+    half, reach = across.size // 2, down.size // 2
+    wide, line = np.zeros(cols + 2 * half, np.float32), np.empty((rows, cols), np.float32)
+    for row in range(rows):
+        for col in range(cols):
+            wide[half + col] = change[row, col]
+        target = line[row]
+        target[:] = 0
+        for k in range(across.size):
+            tap, part = across[k], wide[k : k + cols]
+            for col in range(cols):
+                target[col] += tap * part[col]
+    for row in range(rows):
+        target = out[row]
+        target[:] = 0
+        for k in range(down.size):
+            at = row + k - reach
+            if 0 <= at < rows:
+                tap, part = down[k], line[at]
+                for col in range(cols):
+                    target[col] += tap * part[col]
+
+
+@njit(nogil=True, cache=True)
+def _usual(change, weight, noise, usual, newest, after, deviation):
+    """Fills `after`, the usual square with this change's, whose weight is `newest`, and `deviation`, its root: the
+    highest of a cell and its neighbours, and of their means over three rows."""
+    rows, cols = change.shape
+    for row in range(rows):
+        for col in range(cols):
+            now, was = change[row, col] * change[row, col], usual[row, col]
+            after[row, col] = was + newest * (min(now, np.float32(OUTLIER * OUTLIER) * was) - was)
+    high = np.empty(cols + 2, np.float32)
+    for row in range(rows):
+        above, own, below = after[max(row - 1, 0)], after[row], after[min(row + 1, rows - 1)]
+        for col in range(cols):
+            high[col + 1] = max(own[col], (above[col] + own[col] + below[col]) / np.float32(3))
+        high[0], high[cols + 1] = high[1], high[cols]
+        for col in range(cols):
+            least = np.float32(0.25) * noise / max(weight[row, col], np.float32(LIT))
+            deviation[row, col] = np.sqrt(max(max(high[col], high[col + 1]), max(high[col + 2], least)))
+
+
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
+def _highest(steps, offsets, best):
+    """Fills `best` with the largest sum of four steps along the lines that end at each cell."""
     _, rows, cols = steps.shape
     for row in range(rows):
-        line, at = best[row], which[row]
-        one, two, three, four = steps[0, row], steps[1, row], steps[2, row], steps[3, row]
-        for col in range(cols):
-            line[col], at[col] = 0.0, 0
+        best[row] = 0
         for k in range(offsets.shape[0]):
-            second, third, fourth = offsets[k, 1], offsets[k, 2], offsets[k, 3]
-            for col in range(max(0, fourth), min(cols, cols + fourth)):
-                total = one[col] + two[col - second] + three[col - third] + four[col - fourth]
-                if total > line[col]:
-                    line[col], at[col] = total, k
+            low, high = max(0, offsets[k, 3]), min(cols, cols + offsets[k, 3])
+            line, one = best[row, low:high], steps[0, row, low:high]
+            two = steps[1, row, low - offsets[k, 1] : high - offsets[k, 1]]
+            three = steps[2, row, low - offsets[k, 2] : high - offsets[k, 2]]
+            four = steps[3, row, low - offsets[k, 3] : high - offsets[k, 3]]
+            for i in range(high - low):
+                line[i] = max(line[i], (one[i] + two[i]) + (three[i] + four[i]))
+
+
+@njit(nogil=True, cache=True)
+def _seeds(steps, offsets, least, best, seeds):
+    """Fills `seeds` with (row, col, speed's number, score) of the local maxima above `least`: their number."""
+    _, rows, cols = steps.shape
     n = 0
     for row in range(rows):
         for col in range(cols):
@@ -272,7 +360,15 @@ def _seeds(steps, offsets, least, best, which, seeds):
                     if best[r, c] > own:
                         highest = False
             if highest and n < seeds.shape[0]:
-                seeds[n, 0], seeds[n, 1], seeds[n, 2], seeds[n, 3] = row, col, which[row, col], own / 2
+                seeds[n, 0], seeds[n, 1], seeds[n, 2], seeds[n, 3] = row, col, 0, own / 2
+                most = np.float32(0)
+                for k in range(offsets.shape[0]):
+                    if 0 <= col - offsets[k, 3] < cols:
+                        total = (steps[0, row, col] + steps[1, row, col - offsets[k, 1]]) + (
+                            steps[2, row, col - offsets[k, 2]] + steps[3, row, col - offsets[k, 3]]
+                        )
+                        if total > most:
+                            most, seeds[n, 2] = total, k
                 n += 1
     return n
 
@@ -328,7 +424,7 @@ def _grow(change, noise, times, seed, motion, fit):
 def _rival(change, noise, times, newest, turn, axis, radius):
     """The largest score, over all these steps, of a point that turns within the radius and is near `newest` at last."""
     cols, best = change.shape[1], 0.0
-    span = times[-1]
+    span = times[-1] - times[0]
     for i in range(int(2 * REACH / FINE) + 1):
         x = newest - REACH + FINE * i
         room = radius * radius - (x - axis) * (x - axis)
@@ -339,7 +435,7 @@ def _rival(change, noise, times, newest, turn, axis, radius):
         for j in range(-n, n + 1):
             total, weight = 0.0, 0.0
             for k in range(times.size):
-                c = int(np.floor(_place(x, fastest * j / n, times[k], turn, axis) + 0.5))
+                c = int(np.floor(_place(x, fastest * j / n, times[k] - times[0], turn, axis) + 0.5))
                 if c >= 0 and c < cols:
                     s = noise[k, c]
                     total += min(change[k, c] / s, CLIP) / s

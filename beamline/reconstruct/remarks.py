@@ -80,6 +80,18 @@ def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
     )
 
 
+def _crossing_said(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int64], first: int, side: int) -> str:
+    """Odd views that one object makes on its way through the field."""
+    rows = min(odd.rows[0] for odd in parts), max(odd.rows[1] for odd in parts)
+    speed = odd_views.speed_of(parts) * side
+    return (
+        f"one object that crosses, seen in {count(len(parts), 'view')} of frames {frames[parts[0].view]} ... "
+        f"{frames[parts[-1].view]}, rows {first + rows[0] * side} ... {first + rows[1] * side - 1}, "
+        f"{abs(speed):.1f} px a view to the {'right' if speed > 0 else 'left'} "
+        f"(absorbs {'more' if parts[0].score > 0 else 'less'}; `beamline monitor` shows its whole way)"
+    )
+
+
 def stray_mass_warning(made: ReconOutcome, found: stray_mass.StrayMass) -> str:
     """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
     if found.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
@@ -121,13 +133,17 @@ def odd_views_warning(
     if not found:
         return ""
     first, side = (selection.rows or (0, 0))[0], selection.binning
-    places = [
+    frames = prepared.projections.view_ids
+    crossing = odd_views.on_a_line(found)
+    places = [_crossing_said(crossing, frames, first, side)] if crossing else []
+    places += [
         f"frame {prepared.projections.view_ids[odd.view]}, rows {first + odd.rows[0] * side} ... "
         f"{first + odd.rows[1] * side - 1}, columns {odd.cols[0] * side} ... {odd.cols[1] * side - 1} "
         f"(absorbs {'more' if odd.score > 0 else 'less'})"
-        for odd in sorted(found, key=lambda odd: -abs(odd.score))[:_NAMED]
+        for odd in sorted((odd for odd in found if odd not in crossing), key=lambda odd: -abs(odd.score))[:_NAMED]
     ]
-    more = f"; and {len(found) - len(places)} more" if len(found) > len(places) else ""
+    unnamed = len(found) - len(crossing) - _NAMED
+    more = f"; and {unnamed} more" if unnamed > 0 else ""
     return (
         f"{count(len(found), 'view')} with a part that is not in the volume, by more than {odd_views.LIMIT:g} times "
         f"what is usual there: {'; '.join(places)}{more}. Something was in the beam, or the sample was elsewhere: look "

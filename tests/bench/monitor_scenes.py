@@ -70,7 +70,8 @@ def _solids(*solids: Mapping[str, Any]) -> dict[str, Any]:
 
 
 SPARSE = _solids(
-    {"kind": "tube", "outer_radius": 0.6, "inner_radius": 0.57, "height": 1.2, "attenuation": 1.5},
+    {"kind": "cylinder", "radius": 0.6, "height": 1.2, "attenuation": 1.5},  # a tube: its bore is taken off
+    {"kind": "cylinder", "radius": 0.57, "height": 1.2, "attenuation": -1.5},
     {"kind": "ellipsoid", "semi_axes": [0.03, 0.03, 0.03], "attenuation": 9.0, "centre": [0.4, 0.1, 0.02]},
     {"kind": "ellipsoid", "semi_axes": [0.02, 0.02, 0.02], "attenuation": 9.0, "centre": [-0.2, 0.45, -0.05]},
     {"kind": "box", "edges": [0.12, 0.1, 0.14], "attenuation": 4.0, "centre": [-0.2, -0.12, 0.05]},

@@ -60,7 +60,7 @@ def test_a_check_is_a_frozen_value_and_so_is_its_state(check: Check) -> None:
     assert check == type(check)()
     assert is_dataclass(check.start()) and type(check.start()).__dataclass_params__.frozen  # type: ignore[attr-defined]
     for limit in fields(check):
-        assert replace(check, **{limit.name: 7}) != check
+        assert replace(check, **{limit.name: 7.125}) != check
         with pytest.raises(FrozenInstanceError):
             setattr(check, limit.name, 7)
     assert check.unit and check.meaning and check.meaning[-1] != "."
