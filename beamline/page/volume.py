@@ -59,9 +59,10 @@ def _fbp_of(path: Path, record: ReconRecord) -> Any:
 def grey_windows(values: F32) -> dict[str, tuple[float, float]]:
     """Ends of grey windows by their names, the first one first: matter, then percentiles of all values.
 
-    The first has the darkest and brightest percentiles, unless little metal would leave all other matter black: its end
-    is lowered until the median of the matter is at a third of it. Matter is what is above the noise of air (5 times the
-    rms of negative values) and above 2 % of the range, in volumes whose air is at 0 (within a tenth of the range).
+    The first has the darkest and brightest percentiles, unless metal would leave all other matter black (its median
+    below a sixth of the window): the end is lowered until that median is at a third of it. Matter is what is above the
+    noise of air (5 times the rms of negative values) and above 2 % of the range, in volumes whose air is at 0 (within a
+    tenth of the range).
     """
     if values.size == 0:
         return {"matter": (0.0, 1.0)}
@@ -70,8 +71,8 @@ def grey_windows(values: F32) -> dict[str, tuple[float, float]]:
     negative = values[values < 0].astype(np.float64)
     noise = math.sqrt(float(np.mean(negative**2))) if negative.size else 0.0
     matter = values[values > max(5 * noise, 0.02 * high)]
-    known = matter.size > 0 and low < 0.1 * (high - low)
-    windows = {"matter": _spread(low, min(high, 3 * float(np.median(matter))) if known else high)}
+    middle = float(np.median(matter)) if matter.size and low < 0.1 * (high - low) else math.inf
+    windows = {"matter": _spread(low, 3 * middle if 6 * middle < high else high)}
     for i, (first, last) in enumerate(_PERCENTILES):
         windows[f"{first:g} to {last:g} %"] = _spread(*levels[2 * i : 2 * i + 2])
     return windows
