@@ -98,6 +98,8 @@ class ScanContext:
         truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
         dimmer: logarithm of the light that the beam has lost since the flats, as air beside the sample shows it; NaN
             where none has shown it yet.
+        shake: pixels across and down by which a view stands beside the sample's way at random, standard deviations; 0
+            where noise alone may give as much.
         change: the part that turning since the views before does not explain; None where these are too few, or at
             uneven steps.
     """
@@ -120,6 +122,7 @@ class ScanContext:
     view: CellView | None = None
     truncated: bool = False
     dimmer: float = math.nan
+    shake: tuple[float, float] = (0.0, 0.0)
     change: SampleChange | None = None
 
 
