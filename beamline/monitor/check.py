@@ -126,6 +126,15 @@ class ScanContext:
     change: SampleChange | None = None
 
 
+AGAIN = "`monitor.retake: true` in a configuration has a scan take such views again, after the last one."
+"""Advice of alarms that a view taken again has not."""
+
+
+def again_by(check: str) -> str:
+    """The same of warnings of a check."""
+    return f"`monitor.retake: [{check}]` in a configuration has a scan take such views again, after the last one."
+
+
 def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
     """Counts above the dark [preview row, preview col]; the raw counts where no dark was seen."""
     return preview if context.dark is None else preview - context.dark

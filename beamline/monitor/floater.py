@@ -121,7 +121,8 @@ class FloaterCheck:
         advice = (
             f"Something crosses the field at {abs(trail.speed) * grid.cell:.1f} px a view, faster than the sample's "
             f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a floating "
-            "particle in the beam or on the holder. Look for it, blow it off, and repeat these views."
+            "particle in the beam or on the holder. Look for it and blow it off. `monitor.retake: "
+            f"[{self.name}]` in a configuration has a scan take such views again, after the last one."
         )
         flag = Flag(self.name, Level.WARN, now, trail.score, self.peak, advice, region, int(trail.first))
         return Look(state, flag)
