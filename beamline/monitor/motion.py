@@ -46,7 +46,7 @@ class MotionCheck:
     name: ClassVar[str] = "motion"
     bit: ClassVar[int] = 9
     unit: ClassVar[str] = "pixels, or steps of the stage"
-    meaning: ClassVar[str] = "the sample jumped or slipped: views before and after it do not fit together"
+    meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
     policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[float, Field(ge=0, description="pixels by which the sample may shift between two views")] = 0.5
