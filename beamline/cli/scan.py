@@ -258,7 +258,7 @@ def _results(result: RunResult) -> str:
     if result.flags:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
     if result.retaken:
-        lines.append(f"{'retaken':<10}{result.retaken} views with an alarm; `beamline recon` uses the new ones")
+        lines.append(f"{'retaken':<10}{result.retaken} flagged views; `beamline recon` uses the new ones")
     lines += [f"{'returned':<10}{view.said()}" for view in result.returned]
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
@@ -18,15 +18,29 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.references import ReferenceLimits
 
 
+def _names(retake: bool | tuple[str, ...]) -> bool | tuple[str, ...]:
+    """ValueError for what is no check."""
+    known = [check.name for check in CHECKS]
+    if not isinstance(retake, bool) and (wrong := [name for name in retake if name not in known]):
+        raise ValueError(f"{', '.join(wrong)}: no such check; expected true, false or a list of {', '.join(known)}")
+    return retake
+
+
 class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
     act_after: Annotated[int, Field(ge=1)] = 10
     """Frames in a row with an alarm before the check's policy pauses or stops the scan."""
-    retake: bool = False
-    """Views with an alarm or without a frame are taken again, once, after the last view."""
+    retake: Annotated[bool | tuple[str, ...], AfterValidator(_names)] = False
+    """Views with an alarm or without a frame are taken again, once, after the last view. Names of checks: those with a
+    warning of these checks, too."""
     retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Share of the views that are taken again at most."""
+
+    @property
+    def retaken_warnings(self) -> frozenset[str]:
+        """The checks whose warnings have views taken again."""
+        return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 
 def _keys(limits: type[Any]) -> dict[str, Any]:

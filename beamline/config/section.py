@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
@@ -27,7 +27,8 @@ class Section(BaseModel):
     @classmethod
     def _no_truth_for_numbers(cls, data: Any) -> Any:
         for name, field in cls.model_fields.items():
-            if isinstance(data, dict) and isinstance(data.get(name), bool) and field.annotation is not bool:
+            truths = field.annotation, *get_args(field.annotation)
+            if isinstance(data, dict) and isinstance(data.get(name), bool) and bool not in truths:
                 value = str(data[name]).lower()
                 raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
         return data

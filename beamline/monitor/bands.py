@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
+from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import PixelBox
 from drivers.base.frame import Frame, FrameKind
@@ -134,8 +134,8 @@ class BandsCheck:
         first, after = region[:2] if word == "rows" else region[2:]
         advice = (
             f"Within {word} {first} ... {after - 1} the light {'fell' if score > 0 else 'rose'} by up to "
-            f"{abs(score):.0%} at once, and not elsewhere: a band. Check the camera's link and readout, and slits; "
-            "repeat the view."
+            f"{abs(score):.0%} at once, and not elsewhere: a band. Check the camera's link and readout, and "
+            f"slits. {AGAIN}"
         )
         return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
 

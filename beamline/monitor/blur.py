@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from beamline.core.jit import njit
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter, running_mean
 from beamline.monitor.view import CellValues
@@ -92,7 +92,7 @@ class BlurCheck:
         where = "" if all(over) else (" along the rows", " along the columns")[worst]
         advice = (
             f"The finest detail has {losses[worst]:.0%} less contrast{where} than in the views before: the focus "
-            "moved, or the sample moved while the frame was exposed. Check focus and vibration; repeat these views."
+            "moved, or the sample moved while the frame was exposed. Check focus and vibration. " + again_by(self.name)
         )
         return Look(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 

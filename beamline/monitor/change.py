@@ -39,6 +39,8 @@ class SampleChange:
     residual: CellValues  # float32 [row, col], change of the depth that these do not explain
     noise: float  # robust standard deviation of the residual times the square root of the weight, over the lit cells
     causes: Causes | None = None  # inputs of the fit, for `beside_columns`
+    sigma: tuple[float, float] = (0.0, 0.0)  # pixels, standard deviations of `across` and `down` by noise
+    steps: float = 1.0  # since the view before
 
     def beside_columns(self) -> tuple[float, float, float] | None:
         """Across, down and turn by differences between rows; None if the rows are too much alike.
@@ -89,12 +91,13 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
     # A gain that has changed is no velocity.
     gained = np.float32(sum(one.brighter for one in last[1:]))
     weight = np.minimum(view.weight, last[-1].weight)
-    (gain, across, down, turn), residual, noise, image, turning = _fit(
+    (gain, across, down, turn), residual, noise, image, turning, variances = _fit(
         view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps
     )
     across, down, turn = across * grid.cell, down * grid.cell, turn / float(steps)
     causes = Causes(image, turning, weight, float(steps), grid.cell)
-    return SampleChange(math.expm1(-gain), across, down, turn, residual, noise, causes)
+    sigma = math.sqrt(variances[1]) * noise * grid.cell, math.sqrt(variances[2]) * noise * grid.cell
+    return SampleChange(math.expm1(-gain), across, down, turn, residual, noise, causes, sigma, float(steps))
 
 
 def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
@@ -201,11 +204,11 @@ def _take_off(change, smooth, image, turning, weight, solution, residual, left_o
 
 def _fit(
     now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float
-) -> tuple[list[float], CellValues, float, CellValues, CellValues]:
+) -> tuple[list[float], CellValues, float, CellValues, CellValues, list[float]]:
     """The causes of the change from `one`, the view before; `two` and `four` are those before that.
 
-    Returns the solution (minus gain; across and down in cells; turn in steps), the residual and its noise, and the
-    `image` and `turning` of `Causes`.
+    Returns the solution (minus gain; across and down in cells; turn in steps), the residual and its noise, the `image`
+    and `turning` of `Causes`, and the variances of the solution for a noise of 1.
 
     The median and the solution are numpy's: numba's take ten seconds to compile, in a machine's first scan.
     """
@@ -230,4 +233,5 @@ def _fit(
         if robust == 0:
             share = _shares(left_over, 0.0, weight)
     _, noise = _deviation(residual, 0.0, weight)
-    return solution.tolist(), residual, noise or 0.0, image, turning
+    variances = np.clip(np.diag(np.linalg.inv(normal)), 0.0, None).tolist()
+    return solution.tolist(), residual, noise or 0.0, image, turning, variances

@@ -111,6 +111,8 @@ class ScanContext:
         truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
         dimmer: logarithm of the light that the beam has lost since the flats, as air beside the sample shows it; NaN
             where none has shown it yet.
+        shake: pixels across and down by which a view stands beside the sample's way at random, standard deviations; 0
+            where noise alone may give as much.
         change: the part that turning since the views before does not explain; None where these are too few, or at
             uneven steps.
     """
@@ -133,7 +135,17 @@ class ScanContext:
     view: CellView | None = None
     truncated: bool = False
     dimmer: float = math.nan
+    shake: tuple[float, float] = (0.0, 0.0)
     change: SampleChange | None = None
+
+
+AGAIN = "`monitor.retake: true` in a configuration has a scan take such views again, after the last one."
+"""Advice of alarms that a view taken again has not."""
+
+
+def again_by(check: str) -> str:
+    """The same of warnings of a check."""
+    return f"`monitor.retake: [{check}]` in a configuration has a scan take such views again, after the last one."
 
 
 def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:

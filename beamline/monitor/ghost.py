@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
@@ -126,8 +126,8 @@ class GhostCheck:
         advice = (
             f"A ghost crosses the field, a broad hump: it changes the light by {light:.1%}, "
             f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
-            "Something between source and detector reflects or shadows the beam and moves with the stage: find it; "
-            "repeat these views."
+            "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
+            + again_by(self.name)
         )
         return Look(state, Flag(self.name, level, now, light, limit, advice, region, int(trail.first)))
 

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 
@@ -40,7 +40,6 @@ class LostCheck:
         if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
             return Look(state)
         advice = (
-            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter; repeat "
-            "these views."
+            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
         )
         return Look(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))

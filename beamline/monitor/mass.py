@@ -13,12 +13,11 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import brightest_place
+from beamline.monitor.view import AIR, brightest_place
 from drivers.base.frame import Frame
 
 CALIBRATION = 10  # projections
 SIGMAS = 6.0
-AIR = 0.05  # line integral at the edges up to which the whole sample is in the field
 EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
 
 

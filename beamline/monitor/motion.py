@@ -1,4 +1,4 @@
-"""Motion: jumps and slips of the sample, beyond steady rotation."""
+"""Motion: jumps and slips of the sample, beyond steady rotation, and a sample that shakes."""
 
 from __future__ import annotations
 
@@ -8,24 +8,28 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from beamline.monitor.change import SPAN
+from beamline.monitor.change import SPAN, SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
 from drivers.base.frame import Frame
 
 SIGMAS = 8.0
+CELLS = 0.02  # share of a cell: least limit of a shake
+GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times what was told, above which it is told again
 CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
 
 
 @dataclass(frozen=True)
 class MotionState:
-    """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes."""
+    """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes; `told`: pixels
+    of the shake that was flagged last, 0: none, or it has gone."""
 
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
     turn: FrameScatter = field(default_factory=FrameScatter)
     quiet: int = 0
+    told: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -34,17 +38,22 @@ class MotionCheck:
 
     Only the view of the jump is flagged: later views are as good as earlier ones, but show another position.
     The defaults: half a pixel is what reconstructions from views at two positions begin to show (a doubled edge is as
-    wide as the resolution). A flat face that comes into the beam's direction looks like a slip of up to two steps.
+    wide as the resolution). A flat face that comes into the beam's direction looks like a slip of up to two steps. A
+    shake is a warning, once, and again when it has doubled: a quarter of a pixel takes a quarter of the contrast of the
+    finest detail, of two pixels.
     """
 
     name: ClassVar[str] = "motion"
     bit: ClassVar[int] = 9
     unit: ClassVar[str] = "pixels, or steps of the stage"
-    meaning: ClassVar[str] = "the sample jumped or slipped: views before and after it do not fit together"
+    meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
     policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[float, Field(ge=0, description="pixels by which the sample may shift between two views")] = 0.5
     steps: Annotated[float, Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
+    shake: Annotated[
+        float, Field(ge=0, description="pixels, a standard deviation, by which views may stand beside the sample's way")
+    ] = 0.25
 
     start = MotionState
 
@@ -52,16 +61,37 @@ class MotionCheck:
         change = context.change
         if change is None:
             return Look(state)
-        usual = state.across, state.down, state.turn
-        found = change.across, change.down, change.turn
         after = MotionState(
             state.across.with_figure(change.across),
             state.down.with_figure(change.down),
             state.turn.with_figure(change.turn),
             max(state.quiet - 1, 0),
+            state.told,
         )
         if not state.across.ready or state.quiet:
             return Look(after)
+        jump = self._jump(state, after, frame.index, change)
+        return self._shake(after, frame.index, context) if jump is None else jump
+
+    def _shake(self, state: MotionState, row: int, context: ScanContext) -> Look[MotionState]:
+        assert context.grid is not None
+        across, down = context.shake
+        size, limit = math.hypot(across, down), max(self.shake, CELLS * context.grid.cell)
+        if state.told and size < GONE * limit:
+            return Look(replace(state, told=0.0))
+        if size <= max(limit, GROWN * state.told):
+            return Look(state)
+        advice = (
+            f"The sample shakes: at random, views stand {across:.2f} px across and {down:.2f} px down beside its way "
+            "(standard deviations of the last hundred views or fewer). Look for vibration and for runout of the stage. "
+            "The views are of use: `beamline recon --calibrate shifts` finds the place of each."
+        )
+        return Look(replace(state, told=size), Flag(self.name, Level.WARN, row, size, limit, advice))
+
+    def _jump(self, state: MotionState, after: MotionState, row: int, change: SampleChange) -> Look[MotionState] | None:
+        """A jump or a slip; None where there is none."""
+        usual = state.across, state.down, state.turn
+        found = change.across, change.down, change.turn
         limits = self.alarm, self.alarm, self.steps
         limit_across, limit_down, limit_turn = (
             max(least, SIGMAS * s.sigma) for least, s in zip(limits, usual, strict=True)
@@ -90,5 +120,5 @@ class MotionCheck:
                 "the views from here on to fit the others, or leaves them out."
             )
         else:
-            return Look(after)
-        return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, frame.index, score, limit, advice))
+            return None
+        return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, row, score, limit, advice))

@@ -28,6 +28,7 @@ REACH = 2.0  # cells that the rim may move within these: the kept view goes on b
 LATER = 8  # views after the kept one at least
 CELLS = (0.05, 0.5, 0.25)  # shares of a cell: least limits of a shift, of a remainder and of the axis
 SIGMAS = 8.0  # standard deviations of the noise that a shift must have
+SHAKEN = 5.0  # standard deviations of the places of single views, where the sample shakes
 FEWEST = 16  # columns that can be laid on others
 TURNS = 6  # rounds of the fit
 SEARCH = 0.4  # of the field: how far the axis may be from its middle, twice
@@ -53,12 +54,13 @@ class Kept:
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A view laid on another: its shift across and down, which noise makes uncertain by `sigma`, and the remainder as
-    a shift; all in pixels."""
+    a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in the shift."""
 
     across: float
     down: float
     remainder: float
     sigma: float
+    places: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,7 @@ class OppositeCheck:
                 fit = lay_on(one, turn / step, view, grid, mirrored=False)
                 if fit is None:
                     return Look(state)
-                return Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", grid))
+                return Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
         return Look(state)
 
     def _mirrored(
@@ -138,10 +140,12 @@ class OppositeCheck:
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
-        flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context.grid)
+        flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context)
         state = replace(state, axis=usual)
         stated = context.axis_col
-        if flag is not None or not first or stated is None or abs(axis - stated) <= max(self.axis, CELLS[2] * cell):
+        shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
+        limit = max(self.axis, CELLS[2] * cell, shaken)
+        if flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return Look(state, flag)
         advice = (
             f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
@@ -149,9 +153,12 @@ class OppositeCheck:
         )
         return Look(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
-    def _moved(self, fit: Fit, row: int, other: str, grid: CellGrid) -> Flag | None:
-        moved = math.hypot(fit.across, fit.down)
-        limits = max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma), max(self.changed, CELLS[1] * grid.cell)
+    def _moved(self, fit: Fit, row: int, other: str, context: ScanContext) -> Flag | None:
+        assert context.grid is not None
+        moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
+        # The first pair, which gave the axis, had views beside the sample's way, too.
+        shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
+        limits = max(self.warn, CELLS[0] * cell, SIGMAS * fit.sigma, shaken), max(self.changed, CELLS[1] * cell)
         if moved <= limits[0] and fit.remainder <= limits[1]:
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])
@@ -219,7 +226,8 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
     sigma = math.sqrt(own / SMOOTHER / float(np.diag(normal)[1:][told].min()))
     # Both views begin at `first`: mirrored about the frame's middle their columns are elsewhere.
     off = first + last - grid.shape[1] if mirrored else 0
-    return Fit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell)
+    places = 1 + (1 - steps) ** 2 + steps**2
+    return Fit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
 
 
 def _nearest(before: Reals, now: Reals) -> int:

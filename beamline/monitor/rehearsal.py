@@ -8,11 +8,11 @@ import numpy as np
 
 from beamline.monitor.change import SPAN
 from beamline.monitor.check import ScanContext
-from beamline.monitor.digest import digest
+from beamline.monitor.digest import digests
 from beamline.monitor.watch import CheckError, Monitor, look, start
 from drivers.base.frame import Frame, FrameKind
 
-_SIDE, _BIN = 256, 4  # pixels of a toy frame, and of a pixel of its preview
+_SIDE, _BIN = 256, 8  # pixels of a toy frame, and of a pixel of its preview, whose blocks are joined
 _DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts
 _SATURATION, _STEP = 65_535, 0.02  # counts; rad from view to view
 _REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
@@ -40,5 +40,5 @@ def rehearse(monitor: Monitor) -> None:
         counts[row, row] = 60_000  # a spot
         frame = Frame(counts, kind, row, row, row, _STEP * row, 1.8e9 + row, 0.1)
         with suppress(CheckError):
-            toy, _ = look(toy, frame, digest(counts, _SATURATION, _BIN))
+            toy, _ = look(toy, frame, digests(counts, _SATURATION, _BIN)[0])
     _REHEARSED.add(checks)

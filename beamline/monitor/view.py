@@ -23,6 +23,7 @@ EDGE = 2  # cells at either edge that say whether the sample ends within the fie
 SEEN = 0.02  # least transmission of a place that shows the beam
 PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
 COVERED = 0.1  # line integral at the brightest place: with more there is no air, or the beam fell earlier
+AIR = 0.05  # line integral up to which the sample leaves air at the edges, and a loss of light needs no view before
 DRIFT_STEP = 0.02  # logarithm of the light by which a beam may drift from a view to the next that shows it
 EVEN, EVEN_NOISE = 0.2, 0.01  # share of a loss of light by which both edges and the brightest place may differ; noise
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
@@ -157,7 +158,7 @@ def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
     now = brightest_place(view, grid)
     places = (*view.edges, now)
     even = max(places) - min(places) <= EVEN * abs(now) + EVEN_NOISE
-    if even and (abs(now) <= COVERED or abs(now - before) <= DRIFT_STEP or 0 < now < before):
+    if even and (abs(now) <= AIR or abs(now - before) <= DRIFT_STEP or 0 < now < before):
         return now
     return min(before, max(now, 0.0)) if before > 0 else before
 

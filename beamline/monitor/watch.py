@@ -16,6 +16,7 @@ from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, mor
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.scatter import running_mean
+from beamline.monitor.shake import Shake
 from beamline.monitor.spots import spots_of
 from beamline.monitor.view import CellView, dimmer_than_flats, grid_of, light_left, view_of
 from drivers.base.frame import Frame, FrameKind
@@ -42,6 +43,7 @@ class Monitor:
         kept: a projection with light every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
         light: of the beam, over the views so far.
+        shake: of the sample, likewise.
     """
 
     context: ScanContext
@@ -54,6 +56,7 @@ class Monitor:
     kept: tuple[CellView, ...] = ()
     cut: float = 0.0
     light: LightOverScan = field(default_factory=LightOverScan)
+    shake: Shake = field(default_factory=Shake)
 
     def drift(self) -> str:
         """What became of the beam's light over the scan, in words; "" where it stayed within the limit of `beam`."""
@@ -141,11 +144,13 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     kept = monitor.kept
     if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
         kept = (*kept, view)
-    context = replace(context, view=view, change=change, dimmer=dimmer_than_flats(view, grid, context.dimmer))
+    shake = monitor.shake.with_change(change)
+    dimmer = dimmer_than_flats(view, grid, context.dimmer)
+    context = replace(context, view=view, change=change, dimmer=dimmer, shake=shake.size)
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
     light = monitor.light.with_view(frame.index, in_air(context))
-    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, light=light)
+    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, light=light, shake=shake)
 
 
 def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:

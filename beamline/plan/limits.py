@@ -99,7 +99,7 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
         )
     if plan.retakes:
         yield (
-            f"views with an alarm of the monitor are taken again after the last view, up to {plan.retakes} "
+            f"views that the monitor flags (monitor.retake) are taken again after the last view, up to {plan.retakes} "
             f"(monitor.retake_share): {facts.retake_seconds:.0f} s and {size(facts.retake_bytes)} more at most"
         )
     yield from _reference("flats", plan.flats, plan.exposure, "their light will be scaled")

@@ -82,6 +82,7 @@ class Recorder:
     Args:
         react: told the flags of each frame.
         pause: a request that pauses the scan.
+        retaken_warnings: checks whose warnings have views taken again.
 
     Attributes:
         n_frames: written so far.
@@ -99,9 +100,10 @@ class Recorder:
         sink: Sink,
         react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
         pause: PauseRequest | None = None,
+        retaken_warnings: frozenset[str] = frozenset(),
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
-        self._sink, self._react = sink, react
+        self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._progress = _Progress(timeline)
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
@@ -178,13 +180,23 @@ class Recorder:
         return len(self._alarmed)
 
     @property
-    def alarmed_views(self) -> list[Retake]:
-        """The views among these, with the trigger that each would be taken again by."""
-        return [Retake(row, self._triggers[row]) for row in sorted(self._alarmed & self._triggers.keys())]
+    def alarmed_views(self) -> int:
+        """Number of the views among these."""
+        return len(self._alarmed & self._triggers.keys())
+
+    @property
+    def views_to_retake(self) -> list[Retake]:
+        """Views with an alarm or a warning that asks for it, with the trigger that each would be taken again by."""
+        warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
+        return [Retake(row, self._triggers[row]) for row in sorted((self._alarmed | warned) & self._triggers.keys())]
 
     @property
     def _alarmed(self) -> set[int]:
-        return {frame for flag in self._found if flag.level is Level.ALARM for frame in flag.frames} - self._replaced
+        return self._frames(lambda flag: flag.level is Level.ALARM)
+
+    def _frames(self, which: Callable[[Flag], bool]) -> set[int]:
+        """Frames with such a flag, without those that were taken again."""
+        return {frame for flag in self._found if which(flag) for frame in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""

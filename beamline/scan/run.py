@@ -331,7 +331,7 @@ class _Run:
             missing=tuple(missing),
             flags=recorder.flags,
             alarmed_frames=recorder.alarmed_frames,
-            alarmed_views=len(recorder.alarmed_views),
+            alarmed_views=recorder.alarmed_views,
             retaken=recorder.retaken + acquisition.recovered,
             reference_faults=tuple(faults.values()),
             seconds=time.monotonic() - self.began,
@@ -405,6 +405,7 @@ class _Run:
             sink=self.sink,
             react=AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
             pause=self.pause,
+            retaken_warnings=monitor.retaken_warnings,
         )
 
     def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:
@@ -436,19 +437,19 @@ class _Run:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views with an alarm or without a frame; if there are more than the plan allows, an even spread of them."""
+        """Views that were flagged for it or gave no frame; of more than the plan allows, an even spread."""
         most = self.ready.plan.retakes
         if not most:
             return ()
         recorder.wait()
         lost = [Retake(-1, trigger) for trigger in missing]
-        bad = sorted([*recorder.alarmed_views, *lost], key=lambda view: view.trigger)
+        bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
         chosen = spread(bad, most)
         if not chosen:
             return ()
         if len(chosen) < len(bad):
             message = (
-                f"{len(bad)} views have an alarm or gave no frame, and {most} may be taken again "
+                f"{len(bad)} views were flagged or gave no frame, and {most} may be taken again "
                 f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
             )
             self.sink(Warned(message))

@@ -370,7 +370,8 @@ NUMBERS = (
     ("exposure_s", "record/exposure", hdf5.TIME_UNITS),
     ("period_s", "record/period", hdf5.TIME_UNITS),
     ("no_data", "record/no_data", {"": 1.0}),
-    ("saturation", "instrument/detector/saturation_value", {"": 1.0}),
+    ("saturation", "instrument/detector/saturation_value", {"": 1.0}),  # as NXdetector has it
+    ("saturation", "record/saturation", {"": 1.0}),
     ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
     ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
 )

@@ -241,7 +241,7 @@ def _facts(file: h5py.File, info: ScanInfo) -> None:
             file[path] = np.float64(value)
             file[path].attrs["units"] = unit
     if info.saturation is not None:
-        file[f"{DETECTOR}/saturation_value"] = np.float64(info.saturation)
+        file["/entry/record/saturation"] = np.float64(info.saturation)
     for name, text in (("plan", info.plan), ("config", info.config), ("program", f"splatline {version()}")):
         file[f"/entry/record/{name}"] = text
     if info.filter is not None:

@@ -51,7 +51,7 @@ def test_vibration_raises_the_limit() -> None:
     scan = Blobs(120)
     rng = np.random.default_rng(4)
     scan.depth = lambda view, image: scan.line_integrals(view, tuple(rng.normal(0, 0.4 / BLOCK, 2)))
-    assert only(scan) == []
+    assert [flag.level for flag in only(scan)] == [Level.WARN]  # it is named, and no view is a jump
 
 
 GHOSTS = [(0.6, 8.0, 30.0), (0.3, 3.0, 12.0), (0.1, 15.0, 30.0), (-0.1, 8.0, 30.0), (-0.3, 15.0, 12.0)]

@@ -230,3 +230,17 @@ def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.Mo
     (warning,) = ran.of("warning")
     assert "the check mass failed at frame 0 and is off, the other checks go on" in warning.data["message"]
     assert {event.data["check"] for event in ran.of("flag")} == {"stuck"}
+
+
+@pytest.mark.parametrize("checks", [(), ("timing",), ("blur",)])
+def test_views_with_a_warning_are_to_be_taken_again_where_the_check_is_named(checks: tuple[str, ...]) -> None:
+    recorder = Recorder(
+        Writer(), start(ScanContext(65535, 4, period=1.0)), TIMELINE, preview_bin=2, sink=lambda event: None,
+        retaken_warnings=frozenset(checks),
+    )  # fmt: skip
+    for row in range(9):
+        recorder.put(replace(frame(row), time=1.8e9 + row + (0.4 if row == 5 else 0.0)))
+    recorder.finish()
+    late = [view.row for view in recorder.views_to_retake]
+    assert late == ([5, 6] if checks == ("timing",) else [])  # late, and the next one early after it
+    assert recorder.alarmed_views == 0
