@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -108,11 +108,11 @@ _base = cache(base_scene)
 
 
 def _flags(scene: Scene, seed: int, views: Sequence[int] | None = None) -> tuple[int, tuple[Flag, ...]]:
-    """Frames that were played, and warnings and alarms."""
+    """Frames that were played, and warnings and alarms, each with the row at which it was raised as its frame."""
     monitor, flags, n = watch.start(ScanContext(SATURATION, ROWS * COLS, 0.1)), list[Flag](), 0
     for frame in seen(scene, seed, views=views):
         monitor, found = watch.look(monitor, frame.frame, frame.digest)
-        flags += [flag for flag in found if flag.level is not Level.INFO]
+        flags += [replace(flag, frame=frame.frame.index) for flag in found if flag.level is not Level.INFO]
         n += 1
     return n, tuple(flags)
 

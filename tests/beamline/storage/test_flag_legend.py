@@ -139,3 +139,24 @@ def test_counting_undoes_the_bitmask(found: list[dict[str, Level]]) -> None:
     assert flags.alarmed.tolist() == [Level.ALARM in frame.values() for frame in found]
     assert flags.after(3).alarmed.tolist() == [False] * 3 + flags.alarmed.tolist()
     assert flags.of(flags.alarmed).flagged.all()
+
+
+def test_a_finding_of_earlier_views_has_its_place_in_each_of_them_in_the_file_as_in_memory(tmp_path: Path) -> None:
+    """A crumb that moves, found three views after the last one that shows it."""
+    moving = Flag("floater", Level.WARN, 4, 8.0, 7.0, "", (0, 2, 4, 6), first=2, from_region=(0, 2, 0, 2))
+    found: list[list[Flag]] = [[] for _ in range(9)]
+    found[7] = [moving]
+    flags = FrameFlags.of_flags(found)
+    assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4]
+    assert flags.scores is not None and flags.regions is not None
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+        frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
+        for row, each in enumerate(found):
+            writer.append(replace(frame, index=row), digest(frame.counts), each)
+    with h5py.File(writer.path) as file:
+        log, at = file["entry/frame_log"], [check.name for check in CHECKS].index("floater")
+        np.testing.assert_array_equal(log["flags"], flags.bits)
+        np.testing.assert_array_equal(log["flag_regions"], flags.regions)
+        np.testing.assert_array_equal(log["flag_scores"], flags.scores)
+        assert log["flag_regions"][2:5, at].tolist() == [[0, 2, 0, 2], [0, 2, 2, 4], [0, 2, 4, 6]]
+        assert log["flag_scores"][4, at] == 8.0
