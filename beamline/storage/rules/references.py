@@ -22,7 +22,7 @@ from drivers.base.frame import FrameKind
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
 BLOCK = 4  # pixels a side
-CELLS = 48  # across the frame, about, by which flats are compared with views
+CELLS = 32  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
 
@@ -160,7 +160,7 @@ def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     """Statistics of an image, with its cells."""
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    side = max(BLOCK, image.shape[1] // CELLS)
+    side = max(1, image.shape[1] // CELLS)
     about = row, FrameKind.INVALID, np.nan
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
@@ -168,5 +168,5 @@ def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
         return replace(frame, cells=block_means(image, side))
     known = digest(image, saturation, BLOCK)
     frame = ReferenceFrame.of(*about, known, BLOCK)
-    cells = known.preview if side == BLOCK else digest(image, None, side).preview
+    cells = digest(image, None, side).preview
     return replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
