@@ -81,7 +81,10 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
     exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
     found = [*judge([*dark, *lit], limits)[: len(dark)]]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
-        own, seen = [group for group in lit if start <= group[0].row < end], exposed[(exposed >= start) & (exposed < end)]
+        own, seen = (
+            [group for group in lit if start <= group[0].row < end],
+            exposed[(exposed >= start) & (exposed < end)],
+        )
         witnesses = [reference_frame(source, int(row)) for row in some_of(seen, SAMPLES)] if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
     if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):

@@ -102,5 +102,3 @@ def test_a_band_in_which_the_sample_is_opaque_has_views_with_light() -> None:
     source = ArraySource(np.concatenate([*references, counts]), [2, 1] + [0] * 45, angles)
     selection = Selection(rows=(4, 8), axis_col=scene.axis_col, steps=(Air("none"),))
     assert ScanCorrection(source, selection, pytest.fail).at_once(np.arange(2, 47)).view_ids.size == 45  # type: ignore[arg-type]
-
-

@@ -34,13 +34,15 @@ def test_the_middle_and_the_rim_of_a_wide_disc_have_its_density(radius: float, m
     away = np.hypot(c, c.T)
     small = np.hypot(c - 6, c.T - 9)
     inside, outside = volume[small < 3].mean(), volume[(away < 29) & (small > 6)]
-    assert np.abs(outside / mu - 1).max() < 0.45  # interior tomography is not unique; a constant and a bend remain
+    assert np.abs(outside - mu).max() < 0.3 * mu + 0.001  # interior tomography is not unique: a bend remains
     assert np.ptp(outside) < 0.3 * mu + 0.003
     assert inside - outside.mean() == pytest.approx(0.02, rel=0.1)
 
 
 def test_the_part_in_the_field_is_that_of_a_wide_detector() -> None:
-    wide = fbp(disc(256, 90, 0.004), Geometry.parallel(ANGLES, (3, 256)), Grid.matching(Geometry.parallel(ANGLES, (3, 64))))
+    wide = fbp(
+        disc(256, 90, 0.004), Geometry.parallel(ANGLES, (3, 256)), Grid.matching(Geometry.parallel(ANGLES, (3, 64)))
+    )
     cut = fbp(disc(COLS, 90, 0.004), Geometry.parallel(ANGLES, (3, COLS)))
     c = (np.arange(COLS) - 31.5)[None]
     np.testing.assert_allclose(cut[1][np.hypot(c, c.T) < 28], wide[1][np.hypot(c, c.T) < 28], atol=0.0015)
@@ -49,8 +51,8 @@ def test_the_part_in_the_field_is_that_of_a_wide_detector() -> None:
 def test_views_that_end_in_air_are_filtered_as_ever() -> None:
     lines = disc(COLS, 24, 0.01)
     noise = np.random.default_rng(0).normal(0, 0.005, lines.shape).astype(np.float32)
-    assert edge_levels(lines + noise) is None
-    assert edge_levels(lines + np.float32(0.001)) is None
+    assert edge_levels(lines + noise) == {}
+    assert edge_levels(lines + np.float32(0.001)) == {}
 
 
 def test_rows_are_cut_each_by_itself() -> None:
@@ -58,25 +60,22 @@ def test_rows_are_cut_each_by_itself() -> None:
     lines = disc(COLS, 24, 0.01)
     lines[:, 1] = disc(COLS, 90, 0.01)[:, 1]
     geometry = Geometry.parallel(ANGLES, (3, COLS))
-    levels = edge_levels(lines)
-    assert levels is not None and not levels[:, [0, 2]].any() and levels[:, 1].all()
+    (levels,) = edge_levels(lines).values()
+    assert not levels[:, [0, 2]].any() and levels[:, 1].all()
     inside = disc(COLS, 24, 0.01)
     np.testing.assert_array_equal(fbp(lines, geometry)[[0, 2]], fbp(inside, geometry)[[0, 2]])
 
 
 @pytest.mark.parametrize("zeros", [(0, 0), (10, 0), (0, 10)])
 def test_what_is_beyond_an_edge_is_filtered_with_what_is_inside(zeros: tuple[int, int]) -> None:
-    """By a row that is padded out explicitly."""
-    width = COLS + sum(zeros)
-    fade = np.cos(np.pi / 2 * (np.arange(width) + 0.5) / width) ** 2
-    row = np.ones(COLS)
-    left, right = width + zeros[0], width + zeros[1]
-    padded = np.concatenate((np.zeros(left), row, np.zeros(right)))
-    padded[zeros[0] : left] = fade[::-1]
-    padded[left + COLS : left + COLS + width] = fade
-    whole = filter_projections(padded[None].astype(np.float32))[0, width : 2 * width]
-    part = np.pad(row, zeros)[None].astype(np.float32)
-    found = filter_projections(part)[0] + np.ones(2, np.float32) @ beyond_edges(width, zeros, 1.0, "ram-lak")
+    """By the whole ellipse, of which the row sees the middle."""
+    u = (np.arange(4 * COLS) + 0.5 - 2 * COLS) / (COLS / 2)
+    ellipse = np.sqrt(np.clip(1.5**2 - u**2, 0, None) / (1.5**2 - 1))
+    inside = np.abs(u) < 1
+    whole = filter_projections(ellipse[None].astype(np.float32))[0][inside]
+    row = np.pad(ellipse[inside], zeros)[None].astype(np.float32)
+    sides = beyond_edges(COLS + sum(zeros), zeros, 1.0, "ram-lak", 1.5)
+    found = (filter_projections(row)[0] + np.ones(2, np.float32) @ sides)[zeros[0] : zeros[0] + COLS]
     np.testing.assert_allclose(found, whole, atol=2e-5)
 
 
