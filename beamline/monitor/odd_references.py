@@ -88,8 +88,8 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     if not (same or brighter > limit > 0):
         return None
     said = (
-        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by {brighter:.2g} "
-        f"of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
+        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
+        f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
     )
     return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
 
@@ -295,7 +295,7 @@ def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
 
 def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
     """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
-    row, col = (axis[lit] / max(n, 1) for axis, n in zip(np.indices(lit.shape), lit.shape, strict=True))
+    row, col = (at / max(n, 1) for at, n in zip(np.nonzero(lit), lit.shape, strict=True))
     terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
     return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
 

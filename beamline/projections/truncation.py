@@ -16,9 +16,9 @@ _SHARE = 0.1  # of the depth in the middle
 def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
     """Line integral at each edge ("left", "right") beyond which the sample goes on; empty where it is in the field.
 
-    The median over views and rows is asked, in each quarter of the scan: corners at some angles do not count. It must be
-    more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn about
-    an axis off the middle is cut at the side near the axis on purpose; the other half turn sees what is there.
+    The median over views and rows is asked, in each quarter of the scan: corners at some angles do not count. It
+    must be more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn
+    about an axis off the middle is cut near the axis on purpose; the other half turn sees what is there.
 
     Args:
         data: line integrals [view, row, col].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,7 +65,7 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
     sides = [side for side, n in enumerate(columns) if n]
     light = np.median(profiles[:, sides, :, :3], axis=(1, 2, 3))
     beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
-    return min(float(-np.log(max(np.median(light[views]), 1e-30))) for views in beside)
+    return min(-math.log(max(float(np.median(light[views])), 1e-30)) for views in beside)
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:

@@ -81,7 +81,7 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """They look like one view, and other views outshine them in places."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match="they look like the view in frame 2.*sample was in the beam"):
+    with pytest.raises(DataError, match=r"they look like the view in frame 2.*sample was in the beam"):
         decibels(blocks.source())
 
 

@@ -1,4 +1,4 @@
-"""A sample wider than the field: views that end in matter go on beyond it, and those that end in air stay as they are."""
+"""A sample wider than the field: views that end in matter go on beyond it; those that end in air do not."""
 
 from __future__ import annotations
 
