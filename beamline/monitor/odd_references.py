@@ -89,7 +89,8 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
         return None
     said = (
         f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
-        f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
+        f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: "
+        "the sample was in the beam."
     )
     return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
 

@@ -99,8 +99,8 @@ def without_background(
     if abs(levelled) >= LEAST_SIZE:
         before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
     seen = (
-        f"{before}the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by "
-        f"the {found.air:.0%} of the rays that miss the sample (order {found.order})"
+        f"{before}the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, "
+        f"by the {found.air:.0%} of the rays that miss the sample (order {found.order})"
     )
     # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
     if order is None and found.may_be_matter and found.level + levelled > 0:
