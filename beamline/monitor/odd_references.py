@@ -240,8 +240,11 @@ def _with_sample(
     seen = [_cells(view, base) for view in views]
     light = [[_cells(flat, base) for flat in group] for group in flats]
     means = [np.mean(group, axis=0) for group in light]
+    bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
     found = []
     for at, group in enumerate(flats):
+        if not bright[at] > UNLIT * max(bright):
+            continue  # without light, which is another fault
         if single:  # of two flats each is the other one's only witness
             own, n = light[at], len(group)
             rest = [own[:i] + own[i + 1 :] for i in range(n)]

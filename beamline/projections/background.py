@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.steps.air import Surface
+from beamline.projections.truncation import cut_sides
 from recon.base.arrays import F32, F64, Mask
 from recon.base.binning import bin_views, factor_within
 from recon.base.geometry import Geometry
@@ -86,7 +87,8 @@ def without_background(
         return "", None
     order = None if wanted == "auto" else wanted
     views = _Views(data, geometry, unknown)
-    found, where = _found(views, order) if _see_all_sides(geometry) else (None, None)
+    known = _see_all_sides(geometry) and not cut_sides(data, geometry)  # a sample that fills the field looks like air
+    found, where = _found(views, order) if known else (None, None)
     if found is None or where is None:
         if order is None:
             return "", None
