@@ -216,7 +216,8 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     """
     geometry, rows = plan.geometry, plan.rows[part]
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
-    beyond = edge_levels(projections)
+    low, end = plan.rows_of(part)
+    beyond = edge_levels(projections[:, low - first : end - first])
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
@@ -225,7 +226,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
         for reach, sides in beyond.items():
-            levels = _slab(sides[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
+            levels = _slab(sides[views], geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
             levels *= plan.share[views][..., (0, -1)]
             filtered += levels @ beyond_edges(filtered.shape[2], plan.zeros, geometry.pixel_pitch, plan.filter, reach)
         if not np.isfinite(filtered).all():
