@@ -76,19 +76,21 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     lit = _lit_places(light)
     through = [_without_drift(_log(_cells(view, base), light, lit), lit) for view in views]
     spreads = np.array([_spread(each) for each in through])
-    nearest = int(np.argmin(spreads))
-    if not spreads[nearest] < LIKER * np.median(spreads):
+    beyond = np.array([_beyond_noise(each) for each in through])
+    nearest, noise = int(np.argmin(spreads)), float(np.median([_noise_of(each) for each in through]))
+    if not beyond[nearest] < LIKER * np.median(beyond):
         return None
-    level, noise = np.median(through[nearest]), float(np.median([_noise_of(each) for each in through]))
+    level = np.median(through[nearest])
     brighter = float(np.median([np.percentile(each, WORST) - level for each in through]))
     darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
-    limit = max(BRIGHTER * darker, CHANGE_SIGMAS / 2 * noise)
+    limit = max(BRIGHTER * darker, BLOCK_SIGMAS * noise)
     same = spreads[nearest] < SAME * noise
     if not (same or brighter > limit > 0):
         return None
     said = (
-        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by {brighter:.2g} "
-        f"of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
+        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
+        f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: "
+        "the sample was in the beam."
     )
     return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
 
@@ -238,8 +240,11 @@ def _with_sample(
     seen = [_cells(view, base) for view in views]
     light = [[_cells(flat, base) for flat in group] for group in flats]
     means = [np.mean(group, axis=0) for group in light]
+    bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
     found = []
     for at, group in enumerate(flats):
+        if not bright[at] > UNLIT * max(bright):
+            continue  # without light, which is another fault
         if single:  # of two flats each is the other one's only witness
             own, n = light[at], len(group)
             rest = [own[:i] + own[i + 1 :] for i in range(n)]
@@ -252,10 +257,10 @@ def _with_sample(
             lit = _lit_places(np.maximum.reduce([image, *others]))
             changes = [_log(image, other, lit) for other in others]
             change = min(changes, key=_spread)
-            off, noise = _spread(change), _noise_of(change)
-            if not off > BLOCK_SIGMAS * max(noise, 1e-6):
+            off = _beyond_noise(change)
+            if not off > 0:
                 continue
-            like = [_spread(_log(image, view, lit)) for view in seen]
+            like = [_beyond_noise(_log(image, view, lit)) for view in seen]
             nearest = int(np.argmin(like))
             if like[nearest] < LIKER * off:
                 said = (
@@ -294,7 +299,7 @@ def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
 
 def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
     """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
-    row, col = (axis[lit] / max(n, 1) for axis, n in zip(np.indices(lit.shape), lit.shape, strict=True))
+    row, col = (at / max(n, 1) for at, n in zip(np.nonzero(lit), lit.shape, strict=True))
     terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
     return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
 
@@ -307,11 +312,18 @@ def _spread(values: Places) -> float:
     return float(np.clip(values, low, high).std())
 
 
+def _beyond_noise(values: Places) -> float:
+    """Their spread without the noise; 0 where it may all be noise."""
+    spread, noise = _spread(values), _noise_of(values)
+    chance = 1 + CHANGE_SIGMAS * (2 / max(values.size, 1)) ** 0.5
+    return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0
+
+
 def _noise_of(values: Places) -> float:
-    """Standard deviation of a place by its neighbour along the row: matter and beam change more slowly."""
-    change = np.diff(values, axis=-1)
+    """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
+    change = np.diff(values, 2, axis=-1)
     change = change[np.isfinite(change)]
-    return NORMAL * float(np.median(np.abs(change))) / 2**0.5 if change.size else 0.0
+    return NORMAL * float(np.median(np.abs(change))) / 6**0.5 if change.size else 0.0
 
 
 def _level(frame: ReferenceFrame) -> float:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.steps.air import Surface
+from beamline.projections.truncation import cut_sides
 from recon.base.arrays import F32, F64, Mask
 from recon.base.binning import bin_views, factor_within
 from recon.base.geometry import Geometry
@@ -86,7 +87,8 @@ def without_background(
         return "", None
     order = None if wanted == "auto" else wanted
     views = _Views(data, geometry, unknown)
-    found, where = _found(views, order) if _see_all_sides(geometry) else (None, None)
+    known = _see_all_sides(geometry) and not cut_sides(data, geometry)  # a sample that fills the field looks like air
+    found, where = _found(views, order) if known else (None, None)
     if found is None or where is None:
         if order is None:
             return "", None
@@ -99,8 +101,8 @@ def without_background(
     if abs(levelled) >= LEAST_SIZE:
         before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
     seen = (
-        f"{before}the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
-        f"{found.air:.0%} of the rays that miss the sample (order {found.order})"
+        f"{before}the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, "
+        f"by the {found.air:.0%} of the rays that miss the sample (order {found.order})"
     )
     # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
     if order is None and found.may_be_matter and found.level + levelled > 0:

@@ -170,7 +170,7 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
 
 
 def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
-    """" leave 12° without a view" where the views left have such a gap, which those before had not; else empty."""
+    """ " leave 12° without a view" where the views left have such a gap, which those before had not; else empty."""
     period = np.pi if source.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""

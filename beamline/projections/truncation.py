@@ -9,15 +9,16 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.voxels.view_weights import covers_the_circle
 
-_VIEWS, _COLUMNS, _SHARE = 32, 3, 0.1  # views and columns looked at; share of the depth in the middle
+_VIEWS, _PARTS, _COLUMNS = 32, 4, 3  # views looked at, parts of them, and columns
+_SHARE = 0.1  # of the depth in the middle
 
 
 def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
     """Line integral at each edge ("left", "right") beyond which the sample goes on; empty where it is in the field.
 
-    The median over views and rows is asked, so that a holder or a corner at some angles does not count. It must be
-    more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn about
-    an axis off the middle is cut at the side near the axis on purpose; the other half turn sees what is there.
+    The median over views and rows is asked, in each quarter of the scan: corners at some angles do not count. It
+    must be more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn
+    about an axis off the middle is cut near the axis on purpose; the other half turn sees what is there.
 
     Args:
         data: line integrals [view, row, col].
@@ -31,7 +32,10 @@ def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
         far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
         edges = {far: edges[far]}
     depth = float(np.median(some.max(axis=2)))
-    levels = {side: float(np.median(values)) for side, values in edges.items()}
+    levels = {  # a beam drifts away from its flats; a sample is there from the first to the last view
+        side: min(float(np.median(part)) for part in np.array_split(values, min(_PARTS, len(values))))
+        for side, values in edges.items()
+    }
     return {side: level for side, level in levels.items() if level > max(EDGE, _SHARE * depth)}
 
 

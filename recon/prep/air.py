@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
-_NEXT = 5  # views next to flats
+_NEXT, _OUTER = 5, 3  # views next to flats; columns
+_RISE = 0.005  # line integral, from the edge to an eighth of the width: about the least a surface of the beam has
 _BANDS = 8  # of rows, at most
 
 
@@ -54,7 +56,11 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
 
 
 def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[float], columns: tuple[int, int]) -> float:
-    """Line integral at the edges with air, in the views nearest to a group of flats; the least of all groups.
+    """Line integral at edges that look like air but may be a sample wider than the field; 0 where they are air.
+
+    It is that of the views next to a group of flats, the least of all groups: a beam drifts away from its flats, and a
+    sample is there at once. A sample is thinnest at the edges. So line integrals rise from there on, on all sides, in
+    the median of views and rows; where they do not, the beam is weaker than its flats.
 
     Args:
         profiles: as of `edge_profiles`; positions: [view], of the views in the scan.
@@ -62,9 +68,12 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
         columns: that show air, left and right.
     """
     sides = [side for side, n in enumerate(columns) if n]
-    light = np.median(profiles[:, sides, :, :3], axis=(1, 2, 3))
+    light = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
     beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
-    return min(float(-np.log(max(np.median(light[views]), 1e-30))) for views in beside)
+    depth = min(-math.log(max(float(np.median(light[views])), 1e-30)) for views in beside)
+    outer, inner = (np.median(part, axis=(0, 2, 3)) for part in (profiles[..., :_OUTER], profiles[..., -_OUTER:]))
+    rises = np.log(np.maximum(outer, 1e-30) / np.maximum(inner, 1e-30))[sides]
+    return depth if rises.min() > _RISE else 0.0
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:

@@ -28,6 +28,7 @@ from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice
 
 _VIEWS = 32  # filtered at a time
 _EDGE = 3  # columns at least, whose mean is the level at an edge
+NEAREST, FARTHEST, _STEP = 1.06, 10.0, 0.06  # half widths to the end of a sample; step of their logarithm
 CUT_SHARE, CUT_LEAST = 0.1, 0.02  # of the depth in the middle, and line integral: less at an edge is air
 
 
@@ -76,32 +77,51 @@ def _known(filter: str) -> None:
         raise ValueError(f"unknown filter {filter!r}; use one of {', '.join(get_args(Filter))}")
 
 
-def edge_levels(projections: F32) -> F32 | None:
-    """Line integrals [view, row, side] at the left and the right edge of rows where a sample goes on beyond; 0 in
-    others, and None where all are.
+def edge_levels(projections: F32) -> dict[float, F32]:
+    """Line integrals [view, row, side] at the left and the right edge of rows where a sample goes on beyond, else 0.
 
-    A sample is cut off where the mean of the views at the edge is a tenth of that in the middle, and not noise.
+    A sample is cut off where the mean of the views at the edge is a tenth of that in the middle, and not noise. They
+    are sorted by how far the sample reaches, in half widths of the row, by the ellipse that goes on as the mean of the
+    views does at the edge (Hsieh et al. 2004, Med. Phys. 31, 2385).
     """
     cols = projections.shape[-1]
     n = min(max(_EDGE, cols // 100), cols)
     sides = np.stack([part.mean(axis=-1) for part in (projections[..., :n], projections[..., cols - n :])], axis=-1)
-    level, depth = sides.mean(axis=0), projections.mean(axis=0).max(axis=-1)
-    cut = (level > CUT_SHARE * depth[:, None]) & (level > CUT_LEAST)
-    return np.where(cut, sides, np.float32(0)).astype(np.float32) if cut.any() else None
+    level, mean = sides.mean(axis=0), projections.mean(axis=0)
+    cut = (level > CUT_SHARE * mean.max(axis=-1)[:, None]) & (level > CUT_LEAST)
+    if not cut.any():
+        return {}
+    # The square of an ellipse falls as the square of the way from its middle, which is taken to be that of the row.
+    m = max(cols // 8, n)
+    inner = np.stack([mean[:, m : m + n].mean(axis=-1), mean[:, cols - m - n : cols - m].mean(axis=-1)], axis=-1)
+    edge, within = 1 - n / cols, 1 - (2 * m + n) / cols
+    fall = np.maximum(inner**2 - level**2, 0) / (edge**2 - within**2) if edge > within else np.zeros_like(level)
+    reach = np.sqrt(edge**2 + level**2 / np.maximum(fall, level**2 / FARTHEST**2 + 1e-30))
+    step = np.round(np.log(np.clip(reach, NEAREST, FARTHEST)) / _STEP)
+    found = {}
+    for k in np.unique(step[cut]).tolist():
+        found[math.exp(k * _STEP)] = np.where(cut & (step == k), sides, np.float32(0)).astype(np.float32)
+    return found
 
 
-def beyond_edges(cols: int, zeros: tuple[int, int], pixel_pitch: float, filter: Filter) -> F32:
-    """[side, col]: what filtering would bring inside if a view went on at 1 beyond its edge, and faded over its width.
+def beyond_edges(cols: int, zeros: tuple[int, int], pixel_pitch: float, filter: Filter, reach: float) -> F32:
+    """[side, col]: what filtering brings inside if a row goes on beyond an edge, from 1, as an ellipse does.
 
-    A view that ends in matter makes a rim and loses the middle of a volume, as the filter takes what is beyond for air
+    A row that ends in matter makes a rim and loses the middle of a volume, for the filter takes what is beyond for air
     (Lewitt 1979, Med. Phys. 6, 412). The values inside still lack what only a wider field tells.
+
+    Args:
+        cols: of the row with the columns of zeros, which do not belong to it.
+        reach: from its middle to the ellipse's end, in half widths of the row.
     """
-    width = cols - sum(zeros)
-    fade = np.zeros((2, 3 * cols), np.float32)
-    taper = np.cos(np.pi / 2 * (np.arange(cols) + 0.5) / cols) ** 2
-    fade[1, cols + zeros[0] + width : 2 * cols + zeros[0] + width] = taper[: 2 * cols - zeros[0] - width]
-    fade[0, zeros[0] : cols + zeros[0]] = taper[::-1]
-    return filter_projections(fade, pixel_pitch, filter)[:, cols : 2 * cols]
+    half = (cols - sum(zeros)) / 2
+    length = math.ceil((FARTHEST * 1.1 - 1) * half)
+    u = 1 + (np.arange(length) + 0.5) / half
+    fall = np.sqrt(np.clip(reach**2 - u**2, 0, None) / (reach**2 - 1))
+    first, last = length + zeros[0], length + cols - zeros[1]
+    beyond = np.zeros((2, cols + 2 * length), np.float32)
+    beyond[0, first - length : first], beyond[1, last : last + length] = fall[::-1], fall
+    return filter_projections(beyond, pixel_pitch, filter)[:, length : length + cols]
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +223,8 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     geometry, rows = plan.geometry, plan.rows[part]
     share = _shares_of(plan, rows)
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
-    beyond = edge_levels(projections)
+    low, end = plan.rows_of(part)
+    beyond = edge_levels(projections[:, low - first : end - first])
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
@@ -211,10 +232,10 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         if any(plan.zeros):
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
-        if beyond is not None:
-            levels = _slab(beyond[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
+        for reach, sides in beyond.items():
+            levels = _slab(sides[views], geometry.shifts[views, 1], rows, low, geometry.detector_shape[0])
             levels *= plan.share[views][..., (0, -1)]
-            filtered += levels @ beyond_edges(filtered.shape[2], plan.zeros, geometry.pixel_pitch, plan.filter)
+            filtered += levels @ beyond_edges(filtered.shape[2], plan.zeros, geometry.pixel_pitch, plan.filter, reach)
         if not np.isfinite(filtered).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
         columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)

@@ -95,11 +95,7 @@ class Air:
         import numpy as np
 
         from beamline.projections.background import without_background
-        from beamline.projections.truncation import cut_sides
         from recon.base.masks import areas
-
-        if self.surface == "auto" and cut_sides(views.projections.data, views.geometry):
-            return StepDone("", {"surface": self.surface, "background": "none taken off: the sample fills the field"})
 
         air = views.projections.air
         levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0

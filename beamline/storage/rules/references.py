@@ -21,7 +21,7 @@ from drivers.base.frame import FrameKind
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-CELLS = 48  # across the frame, about, by which flats are compared with views
+CELLS = 32  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
 
@@ -80,7 +80,10 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
     exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
     found = [*judge([*dark, *lit], limits)[: len(dark)]]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
-        own, seen = [group for group in lit if start <= group[0].row < end], exposed[(exposed >= start) & (exposed < end)]
+        own, seen = (
+            [group for group in lit if start <= group[0].row < end],
+            exposed[(exposed >= start) & (exposed < end)],
+        )
         witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
     if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):
@@ -166,7 +169,7 @@ def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     """Statistics of an image, with its cells."""
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     block = check_block(image.shape)
-    side = max(block, image.shape[1] // CELLS)
+    side = max(1, image.shape[1] // CELLS)
     about = row, FrameKind.INVALID, np.nan
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
@@ -174,6 +177,6 @@ def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
         return replace(frame, cells=block_means(image, side))
     known = digest(image, saturation, block)
     frame = ReferenceFrame.of(*about, known, block)
-    cells = known.preview if side == block else digest(image, None, side).preview
+    cells = digest(image, None, side).preview
     frame = replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
     return frame if image.dtype.kind in "ui" else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0

@@ -81,7 +81,7 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
     page = (tmp_path / "v.html").read_text(encoding="utf-8")
     assert "the air of the views is a surface" in page and "Level of air" in page
     said, record = _recon(scans["bent"], tmp_path / "plain.h5", "-m", "fbp", "--air", "columns", "--no-report")
-    assert "Background" not in said and record == "none taken off"
+    assert "Background" not in said and record == "no surface taken off, a line through the air at the edges"
 
 
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:

@@ -135,3 +135,20 @@ def test_the_same_surface_in_a_cone() -> None:
 def test_a_surface_that_no_ray_tells_is_refused() -> None:
     with pytest.raises(DataError, match="too few rays miss the sample"):
         without_background(_views(Cylinder(60.0, 60.0, 0.02)), GEOMETRY, 2)
+
+
+def test_a_positive_background_of_a_beam_brighter_than_its_flats_is_the_beams() -> None:
+    """The line through the edges took off more than stands there now: matter does not make light."""
+    clean = _views(DOME)
+    bent = _surface(0.03, -0.03)
+    views = clean + bent
+    said, _ = without_background(views, GEOMETRY, "auto", levelled=-0.08)
+    assert "a line through the air at the edges was taken off (-0.080 of line integral); then" in said
+    assert "; taken off." in said
+    np.testing.assert_allclose((views - clean).mean(axis=0), 0, atol=0.01)
+    views = clean + bent
+    for levelled in (0.0, 0.05):
+        said, _ = without_background(views, GEOMETRY, "auto", levelled=levelled)
+        assert "the surface is not taken off" in said
+        assert ("a line through the air" in said) == (levelled > 0)
+        np.testing.assert_array_equal(views, clean + bent)

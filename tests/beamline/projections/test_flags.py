@@ -30,11 +30,8 @@ LEVELS = {**ALARMS, FIRST + 3: Level.WARN, FIRST + 20: Level.WARN}
 
 
 def scan(path: Path, levels: dict[int, Level] = LEVELS) -> Path:
-    """The views with an alarm are black: without the flags they would ruin the volume."""
-    frames = [
-        replace(f, counts=np.full_like(f.counts, 100)) if levels.get(f.index) is Level.ALARM else f
-        for f in frames_of(SCAN)
-    ]
+    """The views with an alarm are dark: without the flags they would ruin the volume."""
+    frames = [replace(f, counts=f.counts // 8) if levels.get(f.index) is Level.ALARM else f for f in frames_of(SCAN)]
     return write_flagged(path / "scan.h5", frames, levels)
 
 

@@ -1,0 +1,138 @@
+"""Darks and flats that are none are left out and named, or the scan is refused; none spoils a volume in silence."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from beamline.core.errors import DataError
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.selection import Selection
+from beamline.projections.steps.references import ReferenceCheck
+from beamline.storage.rules.references import reference_groups
+from drivers.base.frame import FrameKind
+from tests.beamline.projections.replaced import AXIS, BEAM, VIEWS, Blocks, decibels, line_integrals
+
+DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
+OTHERS = {DARK: (FLAT, VIEW), FLAT: (DARK, VIEW)}
+
+
+@cache
+def clean(groups: int, n: int, scale: float = 1.0) -> float:
+    found, told = decibels(Blocks(groups, n, scale).source(), scale)
+    assert told == []
+    return found
+
+
+@given(
+    groups=st.integers(1, 3), kind=st.sampled_from((DARK, FLAT)), by=st.integers(0, 1), at=st.integers(0, 2),
+    view=st.integers(0, VIEWS - 1), frame=st.integers(-1, 2),
+)  # fmt: skip
+@settings(deadline=None, max_examples=25)
+def test_any_group_or_frame_of_another_kind_is_named_or_refused(
+    groups: int, kind: FrameKind, by: int, at: int, view: int, frame: int
+) -> None:
+    """`frame` -1: the whole group. Views run on from `view`; the volume is within 0.5 dB of the clean scan's."""
+    blocks = Blocks(groups, 3)
+    group, other = blocks.of(kind)[at % groups], OTHERS[kind][by]
+    frames = np.concatenate(blocks.of(other))
+    begin = min(view, len(frames) - 3) if other is VIEW else 0
+    if frame < 0:
+        group[:] = frames[begin : begin + 3]
+    else:
+        group[frame] = frames[begin]
+    try:
+        found, told = decibels(blocks.source())
+    except DataError as error:
+        assert f"The {kind.name.lower()}s" in str(error) or "The flats" in str(error)  # lit darks, and no beam in flats
+        assert groups == 1 and frame < 0  # no good group is left
+        return
+    assert found > clean(groups, 3) - 0.5
+    assert told and all(f"The {kind.name.lower()}s " in line and "used instead" in line for line in told)
+
+
+@pytest.mark.parametrize("n", [3, 5, 10])
+def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
+    for share in (1.0, 0.5):
+        blocks = Blocks(1, n)
+        blocks.of(DARK)[0][0] += share * BEAM
+        found, (line,) = decibels(blocks.source())
+        assert found > clean(1, n) - 0.1
+        assert line.startswith("The darks 0: there is light in them")
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0, 3.0])
+@pytest.mark.parametrize("at", [0, 1, 2])
+def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(scale: float, at: int) -> None:
+    blocks = Blocks(3, 3, scale)
+    view = (0, VIEWS // 2, VIEWS - 1)[at]
+    blocks.of(FLAT)[at][:] = blocks.taken(np.repeat(line_integrals(scale)[view : view + 1], 3, axis=0))
+    found, told = decibels(blocks.source(), scale)
+    assert told[0].startswith("The flats ") and "the sample was in the beam" in told[0]
+    assert found > clean(3, 3, scale) - 0.5
+
+
+def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
+    """They look like one view, and other views outshine them in places."""
+    blocks = Blocks(1, 3)
+    blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
+    with pytest.raises(DataError, match=r"they look like the view in frame 2.*sample was in the beam"):
+        decibels(blocks.source())
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [(np.nan, "is not finite"), (65535.0, "is saturated"), (0.0, "no beam in them")]
+)
+def test_a_flat_without_counts_is_left_out(value: float, said: str) -> None:
+    blocks = Blocks(1, 3)
+    blocks.of(FLAT)[0][1, 4:] = value
+    if value == 0:
+        blocks.of(FLAT)[0][1] = value
+    found, (line,) = decibels(blocks.source())
+    assert line.startswith("The flats 4: ") and said in line
+    assert found > clean(1, 3) - 0.5
+
+
+def test_a_dark_that_was_never_written_is_left_out() -> None:
+    blocks = Blocks(1, 3)
+    blocks.of(DARK)[0][0] = 0
+    found, (line,) = decibels(blocks.source())
+    assert line.startswith("The darks 0: every pixel is 0") and found > clean(1, 3) - 0.1
+
+
+def test_darks_and_flats_swapped_are_refused() -> None:
+    blocks = Blocks(1, 3)
+    dark, flat = blocks.of(DARK)[0], blocks.of(FLAT)[0]
+    dark[:], flat[:] = flat.copy(), dark.copy()
+    with pytest.raises(DataError, match="The flats 3-5: there is no beam in them"):
+        decibels(blocks.source())
+
+
+def test_half_the_current_at_one_group_of_flats_does_no_harm() -> None:
+    blocks = Blocks(2, 3)
+    blocks.of(FLAT)[1][:] = blocks.of(FLAT)[1] / 2 + 50
+    assert decibels(blocks.source())[0] > clean(2, 3) - 0.5
+
+
+def test_accepted_references_are_used_as_they_were_taken() -> None:
+    blocks = Blocks(1, 3)
+    blocks.of(DARK)[0][0] += BEAM
+    selection = Selection(axis_col=AXIS, steps=(ReferenceCheck("accept"),))
+    correction = ScanCorrection(blocks.source(), selection, pytest.fail)  # type: ignore[arg-type]
+    assert correction._beam is not None
+    np.testing.assert_allclose(correction._beam.references.dark.mean(), 100 + BEAM / 3, rtol=0.01)
+
+
+@pytest.mark.parametrize("scale", [0.05, 1.0])
+@pytest.mark.parametrize("drift", [0.05, 0.15])
+def test_a_beam_that_drifts_is_no_sample_in_the_flats(scale: float, drift: float) -> None:
+    """It leans and fades while views are taken: the first views look most like the flats, and others outshine them."""
+    blocks, ramp = Blocks(2, 3, scale), np.linspace(-1, 1, 48)
+    light = 1 + drift * (np.linspace(0, 1, VIEWS)[:, None, None] * ramp - 0.3)
+    blocks.of(VIEW)[0][:] = 100 + (blocks.of(VIEW)[0] - 100) * light
+    blocks.of(FLAT)[1][:] = 100 + (blocks.of(FLAT)[1] - 100) * light[-1]
+    assert not any(group.faults for group in reference_groups(blocks.source()).judged)  # type: ignore[arg-type]

@@ -1,0 +1,72 @@
+"""A sample wider than the field is named; edges of matter are no air, and those of a beam that drifts are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.truncation import cut_sides
+from recon.base.geometry import Geometry
+from recon.voxels.fbp import fbp
+from tests.beamline.array_source import ArraySource
+
+VIEWS, SHAPE, MU = 90, (4, 64), 0.004
+ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
+SELECTION = Selection(axis_col=31.5)
+
+
+def scan(radius: float, light: np.ndarray | float = 1.0) -> ArraySource:
+    """A disc about the axis in a beam with noise, of which `light` is left in each view; darks and flats before."""
+    u = np.arange(SHAPE[1]) - 31.5
+    lines = np.broadcast_to(2 * MU * np.sqrt(np.clip(radius**2 - u**2, 0, None)), (VIEWS, *SHAPE))
+    rng = np.random.default_rng(2)
+    open_beam = np.full((5, *SHAPE), 40_000.0)
+    counts = [rng.poisson(0 * open_beam), rng.poisson(open_beam), rng.poisson(40_000 * light * np.exp(-lines))]
+    data = (np.concatenate(counts) + rng.integers(99, 102, (VIEWS + 10, *SHAPE))).clip(0, 65535)
+    keys, angles = [2] * 5 + [1] * 5 + [0] * VIEWS, np.concatenate([np.full(10, np.nan), ANGLES])
+    return ArraySource(data.astype(np.uint16), keys, angles)
+
+
+@pytest.mark.parametrize("radius", [45.0, 90.0, 180.0])
+def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
+    told: list[str] = []
+    found = prepare_projections(scan(radius), SELECTION, told.append)  # type: ignore[arg-type]
+    assert found.projections.air_columns == (0, 0)
+    (line,) = told
+    assert line.startswith("The sample goes on beyond the left and right edge of the field (line integral ")
+    volume = fbp(found.projections.data, found.geometry, filter="hann")[1]
+    c = (np.arange(64) - 31.5)[None]
+    middle = volume[np.hypot(c, c.T) < 28].mean()
+    assert middle == pytest.approx(MU, rel=0.1)
+
+
+def test_columns_that_are_said_to_be_air_are_air() -> None:
+    found = prepare_projections(scan(90.0), SELECTION.having(Air("columns")), lambda _: None)  # type: ignore[arg-type]
+    assert min(found.projections.air_columns) > 0
+
+
+@pytest.mark.parametrize("end", [0.6, 0.8, 1.3])
+def test_a_beam_that_drifts_from_its_flats_is_levelled_by_its_air(end: float) -> None:
+    light = np.linspace(1, end, VIEWS)[:, None, None]
+    found = prepare_projections(scan(20.0, light), SELECTION, pytest.fail)  # type: ignore[arg-type]
+    assert min(found.projections.air_columns) > 0
+    assert abs(found.projections.data[:, :, :5].mean()) < 0.005
+
+
+@pytest.mark.parametrize("level", [0.5, 0.68, 1.5])
+def test_a_beam_weaker_than_its_flats_is_levelled_by_its_air(level: float) -> None:
+    """As of Diamond's scan, whose one flat is brighter than the open beam; its air is no thinner at the edges."""
+    found = prepare_projections(scan(20.0, level), SELECTION, pytest.fail)  # type: ignore[arg-type]
+    assert min(found.projections.air_columns) > 0
+    assert abs(found.projections.data[:, :, :5].mean()) < 0.005
+
+
+def test_a_full_turn_about_an_axis_beside_the_middle_is_cut_on_purpose() -> None:
+    angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    lines = np.broadcast_to(np.linspace(1, 0, 64), (180, 2, 64)).astype(np.float32)
+    assert cut_sides(lines, Geometry.parallel(angles, (2, 64), axis_col=8.0)) == {}
+    assert set(cut_sides(lines, Geometry.parallel(angles / 2, (2, 64), axis_col=8.0))) == {"left"}
+    assert set(cut_sides(lines[:, :, ::-1], Geometry.parallel(angles, (2, 64), axis_col=8.0))) == {"right"}
