@@ -255,6 +255,8 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
         limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
     return float(largest) if largest > limit else 0.0
+
+
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
     span = float(degrees[-1] - degrees[0])
