@@ -17,7 +17,7 @@ from pydantic import Field
 from beamline.monitor.change import MOST_STEPS
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.track import Octave, Sample, Track, tracks_of, with_view
+from beamline.monitor.track import Octave, SampleMotion, Track, tracks_of, with_view
 from beamline.monitor.view import CellGrid, PixelBox
 from drivers.base.frame import Frame
 
@@ -39,7 +39,7 @@ HIGHEST = 8  # cells above and below the track in which its rows are sought
 
 
 @dataclass(frozen=True, eq=False)
-class Crumb:
+class SeenCrumb:
     """A crumb that was found.
 
     Attributes:
@@ -66,7 +66,7 @@ class FloaterState:
     start: float = math.nan
     angle: float = math.nan
     step: float = math.nan
-    crumbs: tuple[Crumb, ...] = ()
+    crumbs: tuple[SeenCrumb, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class FloaterCheck:
         """The flag for the views that show the crumb, since the last flag for it."""
         newest, oldest = track.steps[0], track.steps[-1]
         top, below = _rows(track)
-        crumb = Crumb(oldest.rows[0], newest.rows[1], newest.time, float(track.cols[0]), track.speed, top, below)
+        crumb = SeenCrumb(oldest.rows[0], newest.rows[1], newest.time, float(track.cols[0]), track.speed, top, below)
         known = [each for each in state.crumbs if _same(each, crumb)]
         others = tuple(each for each in state.crumbs if each not in known and crumb.last - each.last <= grid.shape[1])
         after = replace(state, crumbs=(*others, crumb))
@@ -145,7 +145,7 @@ def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:
     return replace(state, time=time, angle=angle, step=abs(angle - state.start) / time)
 
 
-def _sample(grid: CellGrid, context: ScanContext, step: float) -> Sample:
+def _sample(grid: CellGrid, context: ScanContext, step: float) -> SampleMotion:
     cols = grid.shape[1]
     if context.axis_col is None:
         middle = (cols - 1) / 2
@@ -153,7 +153,7 @@ def _sample(grid: CellGrid, context: ScanContext, step: float) -> Sample:
     else:
         axes = ((context.axis_col + 0.5) / grid.cell - 0.5,)
     wide = WIDER if context.truncated else CONE if context.cone else MARGIN
-    return Sample(step, axes, cols / 2 * wide)
+    return SampleMotion(step, axes, cols / 2 * wide)
 
 
 def _is_crumb(track: Track) -> bool:
@@ -161,7 +161,7 @@ def _is_crumb(track: Track) -> bool:
     return unlike and track.uneven <= UNEVEN
 
 
-def _same(known: Crumb, crumb: Crumb) -> bool:
+def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
     """Whether it goes on where the known one was going."""
     apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
     rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
@@ -182,6 +182,6 @@ def _rows(track: Track) -> tuple[int, int]:
     return top, max(below, top + 1)
 
 
-def _region(grid: CellGrid, crumb: Crumb, col: float) -> PixelBox:
+def _region(grid: CellGrid, crumb: SeenCrumb, col: float) -> PixelBox:
     height = crumb.below - crumb.top + 2
     return grid.region((crumb.top + crumb.below - 1) / 2, col, height, 2 * BOX)

@@ -50,7 +50,7 @@ LONGER = 1.5  # times as many steps in each round of a fit
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class OctaveStep:
     """One step of an octave: the mean of some views, against its neighbours.
 
     Attributes:
@@ -90,12 +90,12 @@ class Octave:
     views: int
     waiting: tuple[Mean, ...] = ()
     means: tuple[Mean, ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[OctaveStep, ...] = ()
     n: int = 0
     usual: CellValues | None = None
 
 
-class Sample(NamedTuple):
+class SampleMotion(NamedTuple):
     """The sample's motion: rad a view, columns where the axis may be, its largest radius in cells."""
 
     turn: float
@@ -120,7 +120,7 @@ class Track(NamedTuple):
     uneven: float
     row: int
     cols: NDArray[np.float64]
-    steps: tuple[Step, ...]
+    steps: tuple[OctaveStep, ...]
 
     @property
     def speed(self) -> float:
@@ -147,7 +147,7 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
     before, own = octave.means
     change, least = _change(before.depth, own.depth, mean.depth, own.weight)
     noise, usual = _noise(change, own.weight, least, octave.usual, max(FORGET, 1 / (octave.n + 1)))
-    steps = (Step(own.rows, own.time, change, noise), *octave.steps)[:MEMORY]
+    steps = (OctaveStep(own.rows, own.time, change, noise), *octave.steps)[:MEMORY]
     return Octave(octave.views, (), (own, mean), steps, octave.n + 1, usual)
 
 
@@ -178,7 +178,7 @@ def _noise(
     return deviation, after
 
 
-def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
+def tracks_of(octave: Octave, sample: SampleMotion, least: float) -> list[Track]:
     """Tracks through the newest step with a score above `least`, the highest first."""
     if len(octave.steps) < SEED:
         return []
@@ -199,7 +199,7 @@ def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
     return sorted((track for track in found if track is not None), key=lambda track: -track.score)
 
 
-def _track(octave: Octave, row: int, col: float, speed: float, sample: Sample, least: float) -> Track | None:
+def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMotion, least: float) -> Track | None:
     """The best track through a seed; None where its score is not above `least`."""
     times = np.array([octave.steps[0].time - step.time for step in octave.steps])
     change = np.stack([step.change[row] for step in octave.steps])

@@ -17,8 +17,10 @@ import weakref
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import h5py
+if TYPE_CHECKING:
+    import h5py
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 
@@ -102,6 +104,8 @@ def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
     Raises:
         OSError, ValueError: as h5py.File.
     """
+    import h5py  # a command that only asks about locks, and its help, load without it
+
     try:
         return h5py.File(path, "r")
     except OSError as error:

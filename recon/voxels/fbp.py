@@ -225,6 +225,8 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
     low, end = plan.rows_of(part)
     beyond = edge_levels(projections[:, low - first : end - first])
+    for sides in beyond.values():
+        sides[..., np.array(plan.zeros) > 0] = 0  # what is beyond this edge is seen by the opposite views
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])

@@ -29,7 +29,7 @@ def test_commands(command: str) -> None:
     assert main.get_command(None, command) is not None  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("command", re.findall(r"`beamline scan my\.yaml ([^`]*)`", TEXT))
+@pytest.mark.parametrize("command", re.findall(r"`beamline scan my\.yaml ([^`]*--set[^`]*)`", TEXT))
 def test_a_scan_that_the_page_asks_for_breaks_no_limit_of_the_template(command: str) -> None:
     words = shlex.split(command)
     overrides = [value for option, value in itertools.pairwise(words) if option == "--set"]

@@ -33,7 +33,7 @@ _HALF_PIXEL = 0.5  # what moves by less is not seen
 
 
 @dataclass(frozen=True)
-class Field:
+class Entry:
     """A field of a file format.
 
     Attributes:
@@ -51,7 +51,7 @@ class Field:
     units: Mapping[str, float] | None = None
 
 
-def not_used(fields: Sequence[Field], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
+def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
     """The fields that a file states and that are not used; a value that may change the volume is a doubt.
 
     Numbers that would be used, were their unit known, are among them.
@@ -129,145 +129,145 @@ _POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y
 UPRIGHT = "the detector is taken to stand upright to the beam"
 _DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
 
-NXTOMO: tuple[Field, ...] = (
-    Field("definition", "tells the kind of the file; the structure decides, not the name"),
-    Field("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
-    Field("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
-    Field("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
-    Field("detector/count_time", "exposure of each frame", units=hdf5.TIME_UNITS),
-    Field(
+NXTOMO: tuple[Entry, ...] = (
+    Entry("definition", "tells the kind of the file; the structure decides, not the name"),
+    Entry("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
+    Entry("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
+    Entry("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
+    Entry("detector/count_time", "exposure of each frame", units=hdf5.TIME_UNITS),
+    Entry(
         "detector/x_pixel_size",
         "width of a pixel: at the sample for a parallel beam, on the detector for a cone",
         units=hdf5.LENGTH_UNITS,
     ),
-    Field(
+    Entry(
         "detector/y_pixel_size",
         "height of a pixel; slices of a parallel beam are as far apart, others are refused",
         units=hdf5.LENGTH_UNITS,
     ),
-    Field("sample/x_pixel_size", "width of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS),
-    Field(
+    Entry("sample/x_pixel_size", "width of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS),
+    Entry(
         "sample/y_pixel_size", "height of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS
     ),
-    Field(
+    Entry(
         "detector/distance",
         "from the sample to the detector: phase, and the magnification of a cone",
         units=hdf5.LENGTH_UNITS,
     ),
-    Field(
+    Entry(
         "instrument/source/distance",
         "from the source to the sample, of either sign, also of an NXsource of another name: a cone beam, unless it "
         "magnifies by less than 1 % and a ray leaves its parallel by less than half a pixel in the whole field",
         units=hdf5.LENGTH_UNITS,
     ),
-    Field("detector/x_flipped", "frames are mirrored left to right as they are read"),
-    Field("detector/y_flipped", "frames are mirrored upside down as they are read"),
-    Field(
+    Entry("detector/x_flipped", "frames are mirrored left to right as they are read"),
+    Entry("detector/y_flipped", "frames are mirrored upside down as they are read"),
+    Entry(
         "detector/transformations",
         "half turns about the axes, by the direction of `gravity`, mirror the frames; other turns are named",
     ),
-    Field("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
-    Field("sample/name", "name in reports"),
-    Field("title", "name in reports"),
-    Field("start_time", "shown"),
-    Field("end_time", "shown"),
-    Field("instrument/name", "shown"),
-    Field("control/data", "ring current of each frame, or another monitor of the beam"),
-    Field("instrument/beam/incident_energy", "energy; also in beam/ and sample/beam/", units=hdf5.ENERGY_UNITS),
-    Field("instrument/beam/incident_wavelength", "energy, where no energy is stated; also in beam/ and sample/beam/"),
-    Field("instrument/monochromator/energy", "energy, where the beam states none", units=hdf5.ENERGY_UNITS),
-    Field("instrument/monochromator/wavelength", "energy, where no energy is stated"),
-    Field(
+    Entry("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
+    Entry("sample/name", "name in reports"),
+    Entry("title", "name in reports"),
+    Entry("start_time", "shown"),
+    Entry("end_time", "shown"),
+    Entry("instrument/name", "shown"),
+    Entry("control/data", "ring current of each frame, or another monitor of the beam"),
+    Entry("instrument/beam/incident_energy", "energy; also in beam/ and sample/beam/", units=hdf5.ENERGY_UNITS),
+    Entry("instrument/beam/incident_wavelength", "energy, where no energy is stated; also in beam/ and sample/beam/"),
+    Entry("instrument/monochromator/energy", "energy, where the beam states none", units=hdf5.ENERGY_UNITS),
+    Entry("instrument/monochromator/wavelength", "energy, where no energy is stated"),
+    Entry(
         "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
     ),
-    Field("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
-    Field("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
-    Field("detector/field_of_view", "the views show whether the field is half", False),
-    Field("detector/half_acquisition", "the views show whether the field is half", False),
-    Field("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
-    Field("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
-    Field("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
-    Field("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
-    Field("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
-    Field("detector/polar_angle", UPRIGHT, False, _true),
-    Field("detector/azimuthal_angle", UPRIGHT, False, _true),
-    Field("detector/x_translation", _POINTS, False, _moves),
-    Field("detector/y_translation", _POINTS, False, _moves),
-    Field("sample/x_translation", _POINTS, False, _moves),
-    Field("sample/y_translation", _POINTS, False, _moves),
-    Field("sample/z_translation", _POINTS, False, _moves),
-    Field("sample/distance", "the sample is taken to be at the rotation axis", False),
-    Field("sample/propagation_distance", "follows from the distances of source and detector", False),
-    Field("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
-    Field("detector/flatfield_applied", _DONE, False, _true),
-    Field("detector/pixel_mask_applied", "defective pixels are searched", False),
-    Field("detector/pixel_mask", "defective pixels are searched", False),
-    Field("detector/flatfield", "flats are the frames whose image_key is 1", False),
-    Field("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
-    Field("detector/countrate_correction_applied", "frames are taken as they are", False),
-    Field("detector/saturation_value", "saturation is judged by the frames", False),
-    Field("detector/underload_value", "frames are taken as they are", False),
-    Field("detector/bit_depth_readout", "saturation is judged by the frames", False),
-    Field("detector/sequence_number", "frames are taken in the order of the file", False),
-    Field("detector/frame_start_number", "frames are taken in the order of the file", False),
-    Field("detector/real_x_pixel_size", "x_pixel_size is used", False),
-    Field("detector/real_y_pixel_size", "y_pixel_size is used", False),
+    Entry("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
+    Entry("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
+    Entry("detector/field_of_view", "the views show whether the field is half", False),
+    Entry("detector/half_acquisition", "the views show whether the field is half", False),
+    Entry("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
+    Entry("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
+    Entry("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Entry("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Entry("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
+    Entry("detector/polar_angle", UPRIGHT, False, _true),
+    Entry("detector/azimuthal_angle", UPRIGHT, False, _true),
+    Entry("detector/x_translation", _POINTS, False, _moves),
+    Entry("detector/y_translation", _POINTS, False, _moves),
+    Entry("sample/x_translation", _POINTS, False, _moves),
+    Entry("sample/y_translation", _POINTS, False, _moves),
+    Entry("sample/z_translation", _POINTS, False, _moves),
+    Entry("sample/distance", "the sample is taken to be at the rotation axis", False),
+    Entry("sample/propagation_distance", "follows from the distances of source and detector", False),
+    Entry("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
+    Entry("detector/flatfield_applied", _DONE, False, _true),
+    Entry("detector/pixel_mask_applied", "defective pixels are searched", False),
+    Entry("detector/pixel_mask", "defective pixels are searched", False),
+    Entry("detector/flatfield", "flats are the frames whose image_key is 1", False),
+    Entry("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
+    Entry("detector/countrate_correction_applied", "frames are taken as they are", False),
+    Entry("detector/saturation_value", "saturation is judged by the frames", False),
+    Entry("detector/underload_value", "frames are taken as they are", False),
+    Entry("detector/bit_depth_readout", "saturation is judged by the frames", False),
+    Entry("detector/sequence_number", "frames are taken in the order of the file", False),
+    Entry("detector/frame_start_number", "frames are taken in the order of the file", False),
+    Entry("detector/real_x_pixel_size", "x_pixel_size is used", False),
+    Entry("detector/real_y_pixel_size", "y_pixel_size is used", False),
 )
 
-EXCHANGE: tuple[Field, ...] = (
-    Field("implements", "shown"),
-    Field("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
-    Field("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
-    Field("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
-    Field("exchange/theta", "angle of each projection, by its `units`; degrees without them"),
-    Field("exchange/title", "name in reports"),
-    Field("measurement/sample/name", "name in reports"),
-    Field(
+EXCHANGE: tuple[Entry, ...] = (
+    Entry("implements", "shown"),
+    Entry("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
+    Entry("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
+    Entry("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
+    Entry("exchange/theta", "angle of each projection, by its `units`; degrees without them"),
+    Entry("exchange/title", "name in reports"),
+    Entry("measurement/sample/name", "name in reports"),
+    Entry(
         "measurement/instrument/monochromator/energy",
         "energy by its `units`; without them joule, as the format says",
         units=EXCHANGE_ENERGY_UNITS,
     ),
-    Field(
+    Entry(
         "measurement/instrument/detector/x_pixel_size",
         "width of a pixel by its `units`; without them metre, as the format says. It is on the detector: times "
         "x_binning, over objective/magnification",
         units=EXCHANGE_LENGTH_UNITS,
     ),
-    Field(
+    Entry(
         "measurement/instrument/detector/y_pixel_size",
         "height of a pixel, as x_pixel_size",
         units=EXCHANGE_LENGTH_UNITS,
     ),
-    Field("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
-    Field("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
-    Field("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
-    Field("exchange/theta_white", "the order of flats among the views is not used", False),
-    Field("exchange/theta_dark", "the order of darks among the views is not used", False),
-    Field("exchange/data_shift_x", _POSES, False, _shifts),
-    Field("exchange/data_shift_y", _POSES, False, _shifts),
-    Field("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
-    Field("exchange/y", "pixels are taken to be evenly spaced; y_pixel_size is used", False),
-    Field("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
-    Field("measurement/instrument/source/current", "one value for the whole scan", False),
-    Field(
+    Entry("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
+    Entry("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
+    Entry("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
+    Entry("exchange/theta_white", "the order of flats among the views is not used", False),
+    Entry("exchange/theta_dark", "the order of darks among the views is not used", False),
+    Entry("exchange/data_shift_x", _POSES, False, _shifts),
+    Entry("exchange/data_shift_y", _POSES, False, _shifts),
+    Entry("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
+    Entry("exchange/y", "pixels are taken to be evenly spaced; y_pixel_size is used", False),
+    Entry("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
+    Entry("measurement/instrument/source/current", "one value for the whole scan", False),
+    Entry(
         "measurement/instrument/detector/exposure_time", "flats and darks are taken to be exposed as the views", False
     ),
-    Field("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
-    Field("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
-    Field("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
-    Field("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
-    Field("measurement/sample/geometry/translation/distances", _POSES, False),
-    Field(
+    Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
+    Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
+    Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
+    Entry("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
+    Entry("measurement/sample/geometry/translation/distances", _POSES, False),
+    Entry(
         "measurement/sample/geometry/orientation/value", "the rotation axis is taken to stand along the columns", False
     ),
-    Field(
+    Entry(
         "measurement/instrument/interferometer/number_of_grid_steps", "phase steps are not combined", False, _disagrees
     ),
-    Field(
+    Entry(
         "measurement/instrument/detection_system/objective/resolution",
         "not in the format; give it as --pixel-size-um",
         False,
     ),
-    Field("process/acquisition/rotation/start", "theta is used", False),
-    Field("process/acquisition/rotation/step", "theta is used", False),
+    Entry("process/acquisition/rotation/start", "theta is used", False),
+    Entry("process/acquisition/rotation/step", "theta is used", False),
 )

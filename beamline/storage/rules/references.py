@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -88,6 +88,7 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
     if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):
         found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
+    found = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in found]
     judged = sorted([*found, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
     rows = [np.array(group.rows, np.int64) for group in judged]
     n = sum(group.kind is FrameKind.DARK for group in judged)
@@ -144,6 +145,12 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
 def some_of(group: Frames, most: int) -> Frames:
     """At most so many, evenly spread."""
     return group[np.unique(np.linspace(0, group.size - 1, most).astype(int))]
+
+
+def _with_unread(source: ScanSource, judged: JudgedGroup, taken: Sequence[Frames]) -> JudgedGroup:
+    """The group with frames of its own that the file does not give: who reads them leaves them out, and names them."""
+    own = next(group for group in taken if judged.rows[0] in group)
+    return replace(judged, rows=tuple(sorted({*judged.rows, *own.tolist()} & {*judged.rows, *source.unreadable})))
 
 
 def _readable(source: ScanSource, rows: Frames) -> list[ReferenceFrame]:

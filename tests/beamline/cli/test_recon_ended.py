@@ -204,7 +204,7 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     assert result.exit_code == 4, result.output
     result = beamline("recon", "scan.h5", *options, "-o", "rest.h5", "--checkpoint", "fit.h5", "--resume", "fit.h5")
     assert result.exit_code == 0, result.output
-    assert "Time, since resumed" in result.stdout
+    assert "Time of reconstruction, since resumed" in result.stdout
     whole, rest = (read_reconstruction(folder / name) for name in ("whole.h5", "rest.h5"))
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
     assert left(folder) == {"scan.h5", "whole.h5", "part.h5", "rest.h5", "fit.h5"}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.monitor.track import MEMORY, Octave, Sample, Track, tracks_of, with_view
+from beamline.monitor.track import MEMORY, Octave, SampleMotion, Track, tracks_of, with_view
 
 SHAPE, NOISE, LIGHT = (32, 128), 0.004, 0.4
-SAMPLE = Sample(np.radians(0.2), (63.5,), 70.0)
+SAMPLE = SampleMotion(np.radians(0.2), (63.5,), 70.0)
 
 
 def played(views: int, depth: float, speed: float, least: float, octave: int = 1, seed: int = 5) -> list[Track]:
@@ -63,7 +63,7 @@ def test_the_score_grows_as_the_root_of_the_views(speed: float) -> None:
 
 def test_a_point_of_the_sample_has_itself_as_rival() -> None:
     rng = np.random.default_rng(4)
-    sample = Sample(np.radians(2.0), (63.5,), 66.0)
+    sample = SampleMotion(np.radians(2.0), (63.5,), 66.0)
     weight, state, tracks = np.full(SHAPE, LIGHT, np.float32), Octave(1), list[Track]()
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]
     for view in range(90):

@@ -15,7 +15,7 @@ from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Field
+from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Entry
 from beamline.storage.rules.validate import validate
 
 ROWS, COLS, VIEWS = 4, 6, 5
@@ -100,7 +100,7 @@ CONE = (("instrument/source/distance", -0.01, "m"), ("detector/distance", 0.01, 
 
 
 @pytest.mark.parametrize("field", [field for field in (*NXTOMO, *EXCHANGE) if not field.used], ids=lambda f: f.where)
-def test_what_is_not_used_is_named(tmp_path: Path, field: Field) -> None:
+def test_what_is_not_used_is_named(tmp_path: Path, field: Entry) -> None:
     def said(value: Any, units: str | None) -> tuple[str, str]:
         change = (field.where, value, units)
         path = exchange(tmp_path / "s.h5", change) if field in EXCHANGE else nxtomo(tmp_path / "s.nx", *CONE, change)
@@ -226,7 +226,7 @@ def test_what_is_used_has_its_value(tmp_path: Path, where: str) -> None:
 
 @pytest.mark.parametrize("field", [field for field in NXTOMO if field.units is not None], ids=lambda f: f.where)
 @pytest.mark.parametrize("units", [None, "furlong"])
-def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Field, units: str | None) -> None:
+def test_a_number_without_a_known_unit_is_named(tmp_path: Path, field: Entry, units: str | None) -> None:
     path = nxtomo(tmp_path / "s.nx", (field.where, np.full(7, 2.0) if "time" in field.where else 2.0, units))
     (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
     assert hit.severity == "warning"
