@@ -13,7 +13,8 @@ from beamline.monitor.rehearsal import rehearse
 from beamline.monitor.watch import start
 
 OF_REALS = {"_sum_reals", "_count_reals"}  # frames of other programs
-IN_KERNELS = {
+# Compiled with the kernel that calls them.
+IN_KERNELS = {"_clipped", "_product", "_smooth", "_weigh", "_folded", "_place", "_longest"}
     "_clipped",
     "_product",
     "_smooth",
