@@ -103,6 +103,19 @@ LINE: tuple[LineFault, ...] = (
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
+NOT_RESTORED: Mapping[str, str] = MappingProxyType(
+    {
+        kind: f"a program that was killed, or lost this stage, left {settings}; "
+        "what stood there before is restored at the end"
+        for kind, settings in {
+            "pm16c": r"RTE 042 for 024, SPDH \d+ for 1000",
+            "pi_gcs": r"VEL \d+\.0{6} for 10\.0{6}, SPA 0xB 60\.0{6} for 100\.0{6}, SPA 0xC 60\.0{6} for 100\.0{6}",
+            "zaber": r"maxspeed \d+ for 16384, motion\.accelonly \d+ for 100, motion\.decelonly \d+ for 100, "
+            r"comm\.checksum 1 for 0",
+        }.items()
+    }
+)
+"""Controller -> what the next scan tells of a stage that was unplugged: its settings could not be restored."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +125,14 @@ class MotionFault:
     Attributes:
         breaks: arranges it before the scan.
         says: controller -> what the error says besides that it stopped short.
+        flags: controller -> what the next scan tells, of flags that it keeps: the place may not be what it counts.
     """
 
     fault: str
     breaks: Callable[[Rig], None]
     says: Mapping[str, str]
     words: str = "it stopped short of"
+    flags: Mapping[str, str] = field(default_factory=dict)
 
 
 def _stop_after_view_5(rig: Rig) -> None:
@@ -129,11 +144,13 @@ MOTION: tuple[MotionFault, ...] = (
         "fault in motion",
         lambda rig: rig.block(stall_at=BETWEEN),
         {"pm16c": "emergency stop", "pi_gcs": "error 1024", "zaber": r"stalled and stopped \(FS\)"},
+        flags={"zaber": r"stalled and stopped \(FS\)"},
     ),
     MotionFault(
         "limit switch",
         lambda rig: rig.block(switch_at=BETWEEN),
         {"pm16c": "limit", "pi_gcs": "positive limit switch", "zaber": r"limit error \(FE\)"},
+        flags={"zaber": r"limit error \(FE\), a limit switch came where none was expected \(WL\)"},
     ),
     MotionFault(
         "stopped by somebody else",
