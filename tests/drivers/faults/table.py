@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 
 from beamline.core.errors import ConfigError
@@ -14,6 +15,7 @@ from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
 
+TESTS = Path(__file__).parents[2]
 FIRST_VIEW = DARKS + FLATS
 """Row of the file."""
 BETWEEN = 21_000
@@ -227,10 +229,52 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("slow link", LedgerError, "`beamline doctor` looks at its link"),
 )
 
+
+@dataclass(frozen=True)
+class FaultElsewhere:
+    """A fault whose test is with the driver or the scan: `test` is its file, under tests, and its name."""
+
+    fault: str
+    words: str
+    test: tuple[str, str]
+
+
+OF_LINES = (
+    FaultElsewhere(
+        "two controllers with one address (Zaber)",
+        "two devices answered one request",
+        ("drivers/stages/zaber/test_stage.py", "test_two_devices_with_one_address_are_refused_before_anything_moves"),
+    ),
+    FaultElsewhere(
+        "another device at the port",
+        "another device answers",
+        ("drivers/stages/zaber/test_stage.py", "test_the_configured_serial_number_is_required"),
+    ),
+)
+OF_MOTION = (
+    FaultElsewhere(
+        "a slip: stalled and recovered, displaced, moved by its knob (Zaber WS, WM, NC); an error of the motion "
+        "(PI 504, 1024, 1025)",
+        "since its last move something happened to it",
+        ("drivers/stages/zaber/test_stage.py", "test_a_slip_between_two_moves_is_told_once_by_the_next"),
+    ),
+    FaultElsewhere(
+        'step scan: moved after it had arrived (another program, the panel, a hunting servo, a "done" that comes '
+        "too early)",
+        "its frame was exposed while the stage was not at its",
+        ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
+    ),
+    FaultElsewhere(
+        "filter, sample mover, monochromator or shutter moved during a block",
+        "It was moved while",
+        ("beamline/scan/test_moved_while_exposed.py", "test_a_device_in_the_beam_that_is_moved_ends_the_scan"),
+    ),
+)
+
 WORDS: Mapping[str, str] = MappingProxyType(
-    {row.fault: row.words for row in LINE}
+    {row.fault: row.words for row in (*LINE, *OF_LINES)}
     | {UNPLUGGED: PORT_FAILED}
-    | {row.fault: row.words for row in (*MOTION, *PULSES, *CAMERA)}
+    | {row.fault: row.words for row in (*MOTION, *OF_MOTION, *PULSES, *CAMERA)}
 )
 """Every fault, in the order of docs/faults.md -> words that the operator sees."""
 
@@ -241,4 +285,7 @@ def applies() -> None:
         assert set(row.not_on) <= set(KINDS) and set(row.harmless_on) <= set(KINDS)
         assert all(row.not_on.values()) and all(row.harmless_on.values())
     assert all(set(row.says) == set(KINDS) for row in MOTION)
+    for elsewhere in (*OF_LINES, *OF_MOTION):
+        path, name = elsewhere.test
+        assert f"def {name}(" in (TESTS / path).read_text(encoding="utf-8"), elsewhere.fault
     assert VIEWS == 12
