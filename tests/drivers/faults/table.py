@@ -287,5 +287,6 @@ def applies() -> None:
     assert all(set(row.says) == set(KINDS) for row in MOTION)
     for elsewhere in (*OF_LINES, *OF_MOTION):
         path, name = elsewhere.test
-        assert f"def {name}(" in (TESTS / path).read_text(encoding="utf-8"), elsewhere.fault
+        text = (TESTS / path).read_text(encoding="utf-8")
+        assert f"def {name}(" in text and elsewhere.words in text, elsewhere.fault
     assert VIEWS == 12

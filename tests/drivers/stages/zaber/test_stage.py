@@ -227,7 +227,10 @@ def test_a_stop_before_opening_is_not_told_for_the_stage_is_where_it_counts(rig:
 
 def test_the_configured_serial_number_is_required(rig: Rig) -> None:
     rig.open(serial="123456").close()
-    with pytest.raises(DeviceRefused, match=r"its serial number is 123456.*Expected 42.*swapped.*Nothing has moved"):
+    with pytest.raises(
+        DeviceRefused,
+        match=r"another device answers: its serial number is 123456.*Expected 42.*swapped.*Nothing has moved",
+    ):
         rig.open(serial="42")
 
 
