@@ -48,7 +48,10 @@ class FoundSettings:
         self._store = store
         if left:
             said = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in left.items())
-            self.said = f"a program that was killed left {said}; what stood there before is restored at the end"
+            self.said = (
+                f"a program that was killed, or lost this stage, left {said}; "
+                "what stood there before is restored at the end"
+            )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
         """Write each of them back, once. The store keeps them if one is not taken."""

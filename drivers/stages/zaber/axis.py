@@ -16,6 +16,7 @@ from drivers.serial.line import Probe
 from drivers.stages.kept import FoundSettings
 from drivers.stages.shared import while_it_moves
 from drivers.stages.zaber.packet import (
+    INTERRUPTED,
     REASONS,
     SLIPPED,
     UNREFERENCED,
@@ -88,6 +89,7 @@ class ZaberAxis:
         """The command of the last move or search, for errors."""
         self.found = FoundSettings()
         self.flags_at_opening: tuple[str, ...] = ()
+        """Without that of a stop, which says nothing of where the stage is."""
         self._line = wiring.line(
             url,
             name,
@@ -106,7 +108,8 @@ class ZaberAxis:
             self._must_have_checksum = True
         number = self._get_if_known("device.id") or self.ask("get deviceid", WHOLE).data
         identity = Identity(number, self.ask("get system.serial", WHOLE).data, self.ask("get version", NUMBER).data)
-        self.flags_at_opening = self.standing("opening").flags
+        flags = self.standing("opening").flags
+        self.flags_at_opening = tuple(flag for flag in flags if flag != INTERRUPTED)
         self.found.values = {setting: self.get(setting) for setting in KEPT}
         if checksums is not None:
             self.found.values[CHECKSUM] = checksums

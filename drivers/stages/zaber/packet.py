@@ -56,6 +56,8 @@ ENDINGS = {
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
 """Flags that can explain why a move ended early, beside those of faults."""
+INTERRUPTED = "NI"
+"""The flag that every stop before the end of a move leaves, also a stop of our own: the stage is where it counts."""
 SLIPPED = frozenset({"WL", "WS", "WM", "NC"})
 """Flags after which the stage may not be where its counts say: beside faults, errors of the move in which they come."""
 LOST = frozenset({"FS", "FQ", "FI", "FA", "FE"})

@@ -18,7 +18,7 @@ from drivers.stages.kept import SettingsStore
 from drivers.stages.shared import LineStage, Stops, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
-from drivers.stages.zaber.packet import LOST, SLIPPED, meaning_of
+from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
 
@@ -206,7 +206,7 @@ class ZaberStage(LineStage):
             raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
         fault = meaning_of(status.flags)
         if self._homing:
-            arrived = status.referenced and "NI" not in status.flags
+            arrived = status.referenced and INTERRUPTED not in status.flags
         else:
             arrived = self._target is None or status.counts == self._target
         if not arrived or (aim and status.grave):

@@ -47,10 +47,11 @@ def test_a_simulated_instrument_has_only_a_computer(tmp_path: Path) -> None:
         "camera library": "not applicable",
         "stage port": "not applicable",
         "disk space": "ok",
+        "file locks": "ok",
         "disk speed": "ok",
         "memory": "ok",
     }
-    assert (done["event"], done["ok"], done["failed"], done["not_applicable"]) == ("done", 4, 0, 3)
+    assert (done["event"], done["ok"], done["failed"], done["not_applicable"]) == ("done", 5, 0, 3)
     speed = next(check for check in checks if check["name"] == "disk speed")
     # demo.yaml: frames of 144 x 160 with previews of 36 x 40, of which flats and darks come fastest
     per_frame, fastest = 144 * 160 * 2 + 36 * 40 * 4, 0.037 + (72 + 5) * 7.2e-6

@@ -220,7 +220,9 @@ def test_a_device_in_the_beam_that_is_moved_ends_the_scan(stage: str, device: st
         used = nudged(instrument, touched, frame, 1, motor_of(getattr(instrument.devices, name)))
         kind, first = ("flats", 2) if frame == 2 else ("projections", 4)
         rows = f"frames {first}-{3 if frame == 2 else 12} of the file"
-        with pytest.raises(InstrumentError, match=rf"{device}: it stood at .* deg, and is at .*{kind} \({rows}\)"):
+        with pytest.raises(
+            InstrumentError, match=rf"{device}: it stood at .* deg, and is at .*It was moved while .*{kind} \({rows}\)"
+        ):
             run_scan(settings, tmp_path, instrument=used)
     (run,) = tmp_path.iterdir()
     with h5py.File(run / "scan.h5") as file:

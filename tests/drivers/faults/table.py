@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 
 from beamline.core.errors import ConfigError
@@ -14,6 +15,7 @@ from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
 
+TESTS = Path(__file__).parents[2]
 FIRST_VIEW = DARKS + FLATS
 """Row of the file."""
 BETWEEN = 21_000
@@ -103,6 +105,19 @@ LINE: tuple[LineFault, ...] = (
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""
+NOT_RESTORED: Mapping[str, str] = MappingProxyType(
+    {
+        kind: f"a program that was killed, or lost this stage, left {settings}; "
+        "what stood there before is restored at the end"
+        for kind, settings in {
+            "pm16c": r"RTE 042 for 024, SPDH \d+ for 1000",
+            "pi_gcs": r"VEL \d+\.0{6} for 10\.0{6}, SPA 0xB 60\.0{6} for 100\.0{6}, SPA 0xC 60\.0{6} for 100\.0{6}",
+            "zaber": r"maxspeed \d+ for 16384, motion\.accelonly \d+ for 100, motion\.decelonly \d+ for 100, "
+            r"comm\.checksum 1 for 0",
+        }.items()
+    }
+)
+"""Controller -> what the next scan tells of a stage that was unplugged: its settings could not be restored."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +127,14 @@ class MotionFault:
     Attributes:
         breaks: arranges it before the scan.
         says: controller -> what the error says besides that it stopped short.
+        flags: controller -> what the next scan tells, of flags that it keeps: the place may not be what it counts.
     """
 
     fault: str
     breaks: Callable[[Rig], None]
     says: Mapping[str, str]
     words: str = "it stopped short of"
+    flags: Mapping[str, str] = field(default_factory=dict)
 
 
 def _stop_after_view_5(rig: Rig) -> None:
@@ -129,11 +146,13 @@ MOTION: tuple[MotionFault, ...] = (
         "fault in motion",
         lambda rig: rig.block(stall_at=BETWEEN),
         {"pm16c": "emergency stop", "pi_gcs": "error 1024", "zaber": r"stalled and stopped \(FS\)"},
+        flags={"zaber": r"stalled and stopped \(FS\)"},
     ),
     MotionFault(
         "limit switch",
         lambda rig: rig.block(switch_at=BETWEEN),
         {"pm16c": "limit", "pi_gcs": "positive limit switch", "zaber": r"limit error \(FE\)"},
+        flags={"zaber": r"limit error \(FE\), a limit switch came where none was expected \(WL\)"},
     ),
     MotionFault(
         "stopped by somebody else",
@@ -210,10 +229,52 @@ CAMERA: tuple[CameraFault, ...] = (
     CameraFault("slow link", LedgerError, "`beamline doctor` looks at its link"),
 )
 
+
+@dataclass(frozen=True)
+class FaultElsewhere:
+    """A fault whose test is with the driver or the scan: `test` is its file, under tests, and its name."""
+
+    fault: str
+    words: str
+    test: tuple[str, str]
+
+
+OF_LINES = (
+    FaultElsewhere(
+        "two controllers with one address (Zaber)",
+        "two devices answered one request",
+        ("drivers/stages/zaber/test_stage.py", "test_two_devices_with_one_address_are_refused_before_anything_moves"),
+    ),
+    FaultElsewhere(
+        "another device at the port",
+        "another device answers",
+        ("drivers/stages/zaber/test_stage.py", "test_the_configured_serial_number_is_required"),
+    ),
+)
+OF_MOTION = (
+    FaultElsewhere(
+        "a slip: stalled and recovered, displaced, moved by its knob (Zaber WS, WM, NC); an error of the motion "
+        "(PI 504, 1024, 1025)",
+        "since its last move something happened to it",
+        ("drivers/stages/zaber/test_stage.py", "test_a_slip_between_two_moves_is_told_once_by_the_next"),
+    ),
+    FaultElsewhere(
+        'step scan: moved after it had arrived (another program, the panel, a hunting servo, a "done" that comes '
+        "too early)",
+        "its frame was exposed while the stage was not at its",
+        ("beamline/scan/test_moved_while_exposed.py", "test_a_view_during_which_it_is_moved_is_taken_again"),
+    ),
+    FaultElsewhere(
+        "filter, sample mover, monochromator or shutter moved during a block",
+        "It was moved while",
+        ("beamline/scan/test_moved_while_exposed.py", "test_a_device_in_the_beam_that_is_moved_ends_the_scan"),
+    ),
+)
+
 WORDS: Mapping[str, str] = MappingProxyType(
-    {row.fault: row.words for row in LINE}
+    {row.fault: row.words for row in (*LINE, *OF_LINES)}
     | {UNPLUGGED: PORT_FAILED}
-    | {row.fault: row.words for row in (*MOTION, *PULSES, *CAMERA)}
+    | {row.fault: row.words for row in (*MOTION, *OF_MOTION, *PULSES, *CAMERA)}
 )
 """Every fault, in the order of docs/faults.md -> words that the operator sees."""
 
@@ -224,4 +285,8 @@ def applies() -> None:
         assert set(row.not_on) <= set(KINDS) and set(row.harmless_on) <= set(KINDS)
         assert all(row.not_on.values()) and all(row.harmless_on.values())
     assert all(set(row.says) == set(KINDS) for row in MOTION)
+    for elsewhere in (*OF_LINES, *OF_MOTION):
+        path, name = elsewhere.test
+        text = (TESTS / path).read_text(encoding="utf-8")
+        assert f"def {name}(" in text and elsewhere.words in text, elsewhere.fault
     assert VIEWS == 12

@@ -38,7 +38,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     assert_at_rest(rig, scanned)
     assert_kept(scanned)
     assert len(scanned.rows()[FrameKind.PROJECTION]) in range(6, VIEWS)
-    assert_next_scan_works(rig, tmp_path)
+    assert_next_scan_works(rig, tmp_path, row.flags.get(kind, ""))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -56,7 +56,7 @@ def test_a_stage_that_stops_early_in_a_step_scan(
     assert_reported_once(scanned)
     assert_at_rest(rig, scanned)
     assert_kept(scanned, list(range(6)))
-    assert_next_scan_works(rig, tmp_path)
+    assert_next_scan_works(rig, tmp_path, row.flags.get(kind, ""))
 
 
 @pytest.mark.parametrize("kind", KINDS)

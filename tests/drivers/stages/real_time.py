@@ -64,7 +64,7 @@ class Kind:
         home: counts at which a search ends.
         garbage: what may come instead of a reply to a question after the position.
         opening: beginnings of the first two things that the driver sends; `among`: a part of a later one.
-        farewell: a part of what it sends last.
+        farewell: parts of the last things that it sends.
     """
 
     driver: StageDriver
@@ -73,7 +73,7 @@ class Kind:
     garbage: tuple[bytes, ...]
     opening: tuple[str, str]
     among: str
-    farewell: str
+    farewell: tuple[str, ...]
     unreferenced: Mapping[str, Any] = field(default_factory=dict)
     homed: bool = True
     home: int = 0
@@ -102,7 +102,7 @@ KINDS = {
         garbage=(*GARBAGE, b"R0S0", b"\x00" * 50 + b"\r\n+0000000\r\n"),
         opening=(r"b'\r\n'", r"b'VER?\r\n'"),
         among="b'TMGR?0",
-        farewell=r"b'LOC\r\n'",
+        farewell=(r"b'LOC\r\n'",),
         homed=False,
         home=50,
     ),
@@ -113,7 +113,7 @@ KINDS = {
         garbage=(*GARBAGE, b"1=0.0", b"2=0.000000\n"),
         opening=(r"b'\n'", r"b'*IDN?\n'"),
         among="b'ACC 1 2000",
-        farewell=r"b'POS? 1\n'",
+        farewell=("b'SPA 1 0xC ", r"b'ERR?\n'"),  # what opening changed is restored, and taken
         unreferenced={"referenced": False, "found_at": 0.5},
     ),
     "zaber": Kind(
@@ -123,7 +123,7 @@ KINDS = {
         garbage=(*GARBAGE, b"@01 1 ", b"@01 1 00 OK IDLE -- 7\r\n"),
         opening=("b'", "b'/1 0 00 get comm.checksum:"),
         among="get device.id",
-        farewell="set comm.checksum 0",
+        farewell=("set comm.checksum 0",),
         unreferenced={"homed": False},
     ),
 }

@@ -103,7 +103,7 @@ def test_those_of_a_killed_program_are_restored_by_the_next_and_said(rig_of: Any
     second = rig.open()
     assert file_of(second.describe(), tmp_path) == file_of(first.describe(), tmp_path)
     second.keep_found_settings(FoundOnDisk(file_of(second.describe(), tmp_path)))
-    assert "a program that was killed left" in str(second.describe()["found_at_opening"])
+    assert "a program that was killed, or lost this stage, left" in str(second.describe()["found_at_opening"])
     _moved(second, 5, FAST)
     second.close()
     # PM16C: REMOTE was set by the program that died

@@ -96,7 +96,8 @@ def test_the_transcript_of_a_real_conversation_is_whole(kind: Kind, serve: Serve
         stage.close()
     text = (tmp_path / "line.txt").read_text()
     sent = [line.split(" ", 2)[2] for line in text.splitlines() if " > " in line]
-    assert kind.farewell in sent[-1]
+    last = sent[-len(kind.farewell) :]
+    assert all(words in line for line, words in zip(last, kind.farewell, strict=True)), last
     assert all(line.startswith(words) for line, words in zip(sent, kind.opening, strict=False)), sent[:2]
     assert any(kind.among in line for line in sent)
 

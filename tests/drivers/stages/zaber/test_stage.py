@@ -211,9 +211,26 @@ def test_a_slip_before_opening_is_in_the_description_and_refuses_nothing(flag: s
     assert stage.wait(LONG) == pytest.approx(0.1, abs=1e-4)
 
 
+def test_a_stop_before_opening_is_not_told_for_the_stage_is_where_it_counts(rig: Rig) -> None:
+    """Every scan that is stopped leaves this flag, and the next one would warn of it."""
+    stage = rig.open()
+    stage.start_move(math.radians(30), SPEED)
+    stage.stop()
+    stage.close()
+    assert "NI" in rig.controller.device.axis.flags
+    again = rig.open()
+    assert "found_at_opening" not in again.describe()
+    again.close()
+    rig.controller.device.axis.flags.add("WM")
+    assert rig.open().describe()["found_at_opening"] == "displaced while it stood (WM)"  # not NI
+
+
 def test_the_configured_serial_number_is_required(rig: Rig) -> None:
     rig.open(serial="123456").close()
-    with pytest.raises(DeviceRefused, match=r"its serial number is 123456.*Expected 42.*swapped.*Nothing has moved"):
+    with pytest.raises(
+        DeviceRefused,
+        match=r"another device answers: its serial number is 123456.*Expected 42.*swapped.*Nothing has moved",
+    ):
         rig.open(serial="42")
 
 
