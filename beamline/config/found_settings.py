@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from zlib import crc32
 
+from beamline.core.errors import DataError
 from beamline.core.files import write_whole
 from drivers.base.protocols import RotationStage
 from drivers.stages.kept import RestoresSettings
@@ -58,7 +59,7 @@ class FoundOnDisk:
         return {}
 
     def save(self, found: Mapping[str, str]) -> None:
-        with suppress(OSError):
+        with suppress(OSError, DataError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(self._path, json.dumps(dict(found)), replace=True)
 

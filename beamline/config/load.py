@@ -70,10 +70,13 @@ def load(
     simulation = tree.data.pop("simulation", None)
     try:
         config = _validated(tree, str(path))
-    except ConfigError:
+    except ConfigError as error:
         if simulation is None:
             raise
-        config = _validated(Tree({**tree.data, "simulation": simulation}, tree.origins), str(path))
+        try:
+            config = _validated(Tree({**tree.data, "simulation": simulation}, tree.origins), str(path))
+        except ConfigError:
+            raise error from None
     return _validated(Tree(rehearsal(config, simulation), tree.origins), str(path))
 
 

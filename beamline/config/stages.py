@@ -44,8 +44,12 @@ class StageSection(Section):
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
         """Its driver, connected at the port, or at `url`; see `StageDriver`. A real one's settings are kept on disk."""
         stage = STAGES[self.kind](url or self.port, self.settings, clock)
-        if not (url or self.port).lower().startswith("sim://"):
-            keep_found_settings(stage)
+        try:
+            if not (url or self.port).lower().startswith("sim://"):
+                keep_found_settings(stage)
+        except BaseException:
+            stage.close()
+            raise
         return stage
 
     def halt(self, clock: Clock) -> None:

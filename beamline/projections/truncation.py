@@ -26,12 +26,15 @@ def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
     n, cols = len(data), data.shape[2]
     if n == 0 or cols < 2 * _COLUMNS:
         return {}
-    some = np.asarray(data[np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))])
-    edges = {"left": some[:, :, :_COLUMNS], "right": some[:, :, -_COLUMNS:]}
+    some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int)).tolist()
+    edges = {
+        "left": np.stack([data[view, :, :_COLUMNS] for view in some]),
+        "right": np.stack([data[view, :, -_COLUMNS:] for view in some]),
+    }
     if geometry.is_off_middle and covers_the_circle(geometry.angles):
         far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
         edges = {far: edges[far]}
-    depth = float(np.median(some.max(axis=2)))
+    depth = float(np.median([data[view].max(axis=1) for view in some]))
     levels = {  # a beam drifts away from its flats; a sample is there from the first to the last view
         side: min(float(np.median(part)) for part in np.array_split(values, min(_PARTS, len(values))))
         for side, values in edges.items()

@@ -31,7 +31,8 @@ def scan_file(path: str | Path) -> Path:
         return path / JOINED
     parts = [part / SCAN for part in parts_of(path) if may_hold_frames(part / SCAN)]
     if len(parts) > 1:
-        raise DataError(f"{path} has {len(parts)} parts that are not joined. {next_step(parts[-1])}")
+        join = f"`beamline recover {path}` joins them."
+        raise DataError(f"{path} has {len(parts)} parts that are not joined. {next_step(parts[-1]) or join}")
     return path / SCAN
 
 

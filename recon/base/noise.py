@@ -165,10 +165,11 @@ def _fine(image: F32) -> F32:
 
 
 def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
-    """Values [..., col] of the columns on the other side of the axis; NaN where there are none."""
+    """Values [..., col] of the columns on the other side of the axis, by cubic splines; NaN where there are none."""
     cols = values.shape[-1]
     at = 2 * axis_col - np.arange(cols)
-    return np.where((at >= 0) & (at <= cols - 1), spline_at(values, np.clip(at, 0, cols - 1)), np.nan)
+    spline = make_interp_spline(np.arange(cols), values, 3, axis=-1)
+    return np.where((at >= 0) & (at <= cols - 1), spline(np.clip(at, 0, cols - 1)), np.nan)
 
 
 def without_layers(stripes: F32, axis_col: float) -> F32:
@@ -178,21 +179,15 @@ def without_layers(stripes: F32, axis_col: float) -> F32:
     the sample around the axis: of 800 pairs of independent columns, one has. Columns without one on the other side stay
     as they are.
     """
-    cols = stripes.shape[1]
-    at = 2 * axis_col - np.arange(cols)
-    seen = (at >= 0) & (at <= cols - 1)
-    mirrored = spline_at(stripes, np.clip(at, 0, cols - 1))
+    across = mirrored(stripes, axis_col)
+    seen = np.isfinite(across[0])
     if seen.sum() < _FEWEST_PAIRS:
         return stripes
-    usual = _SHARED * median_deviation(((stripes - mirrored) / math.sqrt(2))[:, seen])
-    low, high = (extreme(mirrored, (1, 3), mode="nearest") for extreme in (minimum_filter, maximum_filter))
+    usual = _SHARED * median_deviation((stripes - across)[:, seen] / math.sqrt(2))
+    near = np.where(seen, across, 0)
+    low, high = (extreme(near, (1, 3), mode="nearest") for extreme in (minimum_filter, maximum_filter))
     shared = np.where(stripes > 0, np.clip(high, 0, np.maximum(stripes, 0)), np.clip(low, np.minimum(stripes, 0), 0))
     return np.asarray(stripes - np.where(seen & (np.abs(shared) > usual), shared, 0), np.float32)
-
-
-def spline_at(values: NDArray[np.floating], places: NDArray[np.float64]) -> NDArray[np.floating]:
-    """Values [..., col] at places between columns, by cubic splines."""
-    return np.asarray(make_interp_spline(np.arange(values.shape[-1]), values, 3, axis=-1)(places))
 
 
 def air_level(values: F32) -> tuple[float, float]:

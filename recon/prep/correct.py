@@ -165,25 +165,16 @@ class Correction:
     def air_columns(self) -> tuple[int, int]:
         """(left, right) columns of air by the views surveyed so far; (0, 0): no columns."""
         air = self._settings.air
-        if air == "auto":
-            return self._air_found()[0]
-        return (0, 0) if air == "none" else air
-
-    @property
-    def cut_off(self) -> float:
-        """Line integral at edges that look like air and count as sample, see `CorrectionSettings`; 0: none do."""
-        return self._air_found()[1] if self._settings.air == "auto" else 0.0
-
-    def _air_found(self) -> tuple[tuple[int, int], float]:
-        """Columns of air by the views surveyed, and the line integral at the edges if that makes them sample."""
+        if air != "auto":
+            return (0, 0) if air == "none" else air
         if not self._profiles:
-            return (0, 0), 0.0
+            return 0, 0
         profiles, ids = np.concatenate(self._profiles), np.concatenate(self._surveyed)
         columns = air_columns(profiles, self._dark.shape[1])
         if not any(columns) or not np.isfinite(self._settings.sample_from):
-            return columns, 0.0
+            return columns
         depth = edge_depth(profiles, ids, [position for position, _ in self._flats], columns)
-        return ((0, 0), depth) if depth > self._settings.sample_from else (columns, 0.0)
+        return (0, 0) if depth > self._settings.sample_from else columns
 
     def transmission(
         self,

@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from recon.base.arrays import F32
 from recon.base.choices import Rings
-from recon.base.noise import spline_at, without_layers
+from recon.base.noise import median_deviation, mirrored, without_layers
 from recon.base.units import warn_of_other_quantity
 
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
@@ -173,18 +173,16 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
     """
     n, rows, cols = sinograms.shape
     blocks = np.array_split(np.arange(n), min(max(n // _BLOCK, 2), _BLOCKS))
-    right = np.arange(math.ceil(axis_col + _AT_AXIS), cols, dtype=np.float64)
-    left = 2 * axis_col - right
-    right, left = right[left >= 0], left[left >= 0]
+    right = np.arange(math.ceil(axis_col + _AT_AXIS), cols)
+    right = right[2 * axis_col - right >= 0]
     if right.size < _FEWEST_PAIRS:
         return None
     fine = np.stack([[_fine(sinograms[block, row]) for row in range(rows)] for block in blocks])
-    mirrored = spline_at(fine, left)
-    own = fine[..., right.astype(int)]
-    odd, even = (own - mirrored) / math.sqrt(2), (own + mirrored) / math.sqrt(2)
+    own, across = fine[..., right], mirrored(fine, axis_col)[..., right]
+    odd, even = (own - across) / math.sqrt(2), (own + across) / math.sqrt(2)
     mean = odd.mean(axis=0)
-    noise = _spread(odd - mean) / math.sqrt(len(blocks) - 1)
-    return Steadiness(_spread(mean), _spread(even.mean(axis=0)), noise)
+    noise = median_deviation(odd - mean) / math.sqrt(len(blocks) - 1)
+    return Steadiness(median_deviation(mean), median_deviation(even.mean(axis=0)), noise)
 
 
 def _fine(sinogram: F32) -> NDArray[np.floating]:
@@ -192,10 +190,6 @@ def _fine(sinogram: F32) -> NDArray[np.floating]:
     x = np.pad(sinogram, ((0, 0), (2, 2)), mode="edge")
     off = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
     return np.asarray(np.convolve(off, (-0.5, 1, -0.5), mode="same"))
-
-
-def _spread(values: NDArray[np.floating]) -> float:
-    return float(_ROBUST * np.median(np.abs(values)))
 
 
 def stripe_score(sinogram: F32) -> float:

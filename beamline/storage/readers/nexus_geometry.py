@@ -178,6 +178,8 @@ def _flag(detector: h5py.Group, name: str) -> bool:
 
 def _direction(item: h5py.Dataset) -> int | None:
     """Which of x, y, z the attribute `vector` runs along; None for none of them."""
-    vector = np.ravel(np.asarray(item.attrs.get("vector", ()), np.float64))
+    vector = np.ravel(np.asarray(item.attrs.get("vector", ())))
+    if vector.dtype.kind not in "iuf":
+        return None
     along = np.flatnonzero(vector)
     return int(along[0]) if vector.size == 3 and along.size == 1 else None

@@ -14,7 +14,10 @@ from tifffile import natural_sorted
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.stacks import dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
 from beamline.storage.readers.wrapped import has_wrapped, unsigned
@@ -75,8 +78,10 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     for places in find(file):
         keys = np.ravel(places.image_key[()])
         if (keys == kind).any():
-            return _read(path, places.data, np.flatnonzero(keys[: len(places.data)] == kind))
+            return _of_scan(NXtomoSource(path, own_angles=False, data=str(places.data.name)), kind)
     exchange = hdf5.dataset(file, _EXCHANGE[kind])
+    if exchange is not None and hdf5.dataset(file, "exchange/data") is not None:
+        return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
     found = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
@@ -89,6 +94,12 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if found:
         raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
     raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
+
+
+def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
+    """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
+    with source:
+        return _stack(source.read(np.flatnonzero(source.image_key == kind)), str(source.path))
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:

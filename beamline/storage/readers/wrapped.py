@@ -24,6 +24,7 @@ class WrappedSource(ScanSource):
         self.path, self.format, self.shape, self.dtype = base.path, base.format, base.shape, base.dtype
         self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
         self.cone, self.axis_col, self.row_pitch_mm = base.cone, base.axis_col, base.row_pitch_mm
+        self.in_order, self.numbers = base.in_order, base.numbers
 
     def _update(self) -> None:
         """Take over the present frames of `base`."""
@@ -38,7 +39,7 @@ class WrappedSource(ScanSource):
     def _frames_of_base(self, first: int) -> Iterator[Frame]:
         """Frames of `base`, whose rows are those of this scan."""
         for frame in self._base.frames(first):
-            self.unreadable = self._base.unreadable
+            self.unreadable = {**self.unreadable, **self._base.unreadable}
             yield frame
 
     def close(self) -> None:
@@ -100,6 +101,8 @@ class TurnedSource(WrappedSource):
         if base.emission is not None or base.flags is not None:
             raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
         self.shape, self.axis_col = (base.shape[1], base.shape[0]), None
+        if base.row_pitch_mm is not None:
+            self.pixel_size_mm, self.row_pitch_mm = base.row_pitch_mm, base.pixel_size_mm
         self._update()
 
     @property

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.references import BRIGHT, NORMAL, UNLIT, ReferenceFrame
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, look_at, reference_frame, some_of
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
@@ -66,7 +66,9 @@ class ViewLight:
         return not self.known[frame]
 
     def _unlit(self, frame: int) -> bool:
-        image = self.source.read([frame])[0]
+        image = read_known(self.source, [frame])[0]
+        if frame in self.source.unreadable:
+            return False  # it is named and left out by who reads it
         if not np.isfinite(image).any():
             return True
         same = bool(image.min() == image.max())
@@ -107,7 +109,10 @@ def _cells(source: ScanSource, row: int) -> F32:
 
 
 def _mean_cells(source: ScanSource, groups: tuple[Frames, ...]) -> F32:
-    return np.asarray(np.mean([_cells(source, row) for group in groups for row in group.tolist()], axis=0), np.float32)
+    rows = [row for group in groups for row in group.tolist()]
+    cells = {row: _cells(source, row) for row in rows}
+    known = [cells[row] for row in rows if row not in source.unreadable] or list(cells.values())
+    return np.asarray(np.mean(known, axis=0), np.float32)
 
 
 def _of(frame: ReferenceFrame) -> F32:

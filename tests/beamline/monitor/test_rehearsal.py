@@ -15,14 +15,6 @@ from beamline.monitor.watch import start
 OF_REALS = {"_sum_reals", "_count_reals"}  # frames of other programs
 # Compiled with the kernel that calls them.
 IN_KERNELS = {"_clipped", "_product", "_smooth", "_weigh", "_folded", "_place", "_longest"}
-    "_clipped",
-    "_product",
-    "_smooth",
-    "_weigh",
-    "_folded",
-    "_place",
-    "_longest",
-}  # compiled with the kernel that calls them
 
 
 @pytest.mark.parametrize("step", [float("nan"), 0.002])  # rad: a scan's may be that of the toy, or another

@@ -96,7 +96,8 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape:
     n, rows, cols = shape
     angles, x = np.linspace(0, np.pi, n, endpoint=False), np.linspace(-1, 1, cols)
     disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
-    views = np.broadcast_to(disc, shape) + np.random.default_rng(0).normal(0, 0.01, shape)
+    rng = np.random.default_rng(0)
+    views = disc + rng.normal(0, 0.01, shape) + rng.normal(0, 0.02, (rows, cols))  # noise, and gains of pixels
     part = ScanPart(
         None, Selection(), Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2)
     )  # type: ignore[arg-type]

@@ -52,7 +52,7 @@ def _rms(values: NDArray[np.floating]) -> float:
 
 
 @pytest.mark.slow
-def test_gains_are_found_and_the_ball_on_the_axis_stays_as_no_filter_leaves_it(gains: F32) -> None:
+def test_gains_are_found_and_the_ball_on_the_axis_stays(gains: F32) -> None:
     clean = _views(BALL)
     ringed = clean + gains
     found = learn_gains(ringed, GEOMETRY)
@@ -71,7 +71,7 @@ def test_gains_are_found_and_the_ball_on_the_axis_stays_as_no_filter_leaves_it(g
     rings = {name: ring_score((volume - true)[3], (MIDDLE, MIDDLE)) for name, volume in volumes.items()}
     print("\n", errors, ball, rings, _rms(before - true), ring_score((before - true)[3], (MIDDLE, MIDDLE)))
     assert errors["gains"] < min(errors["sort"], errors["vo"], 0.7 * _rms(before - true))
-    assert abs(ball["gains"] - 1) < 0.1 and max(ball["sort"], ball["vo"]) < 0.9
+    assert all(abs(depth - 1) < 0.1 for depth in ball.values())  # it is on both sides of the axis
     assert rings["gains"] < 0.7 * ring_score((before - true)[3], (MIDDLE, MIDDLE))
 
 
