@@ -155,6 +155,9 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
             connected.disarm()
             if apart is None:
                 shutter_of(config, connected, clock, say).close()
+            deadline = clock.now() + PATIENCE  # a stage that slows down takes no settings back
+            while connected.moving() and clock.now() < deadline:
+                clock.sleep(BETWEEN)
 
     done = [_insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
     if apart:

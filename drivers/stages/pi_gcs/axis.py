@@ -242,6 +242,7 @@ class PiGcsAxis:
     def restore(self) -> None:
         """Set what moves and opening have changed back, unless the axis moves: a move under way would follow."""
         if self.found.values and not self.moving():
+            self._line.read_error()  # of a move or a stop before: it says nothing of the settings
             self.found.restore(lambda setting, value: self._line.set(_setting(setting, self._axis, value)))
 
     def _refused(self, problem: str, advice: str, request: str = "") -> DeviceRefused:
