@@ -78,7 +78,8 @@ class GcsAxis:
         self.per_degree = build.counts_per_turn / 360.0
         self.error = 0
         self.referenced = build.referenced
-        self.velocity, self.acceleration, self.deceleration = 10.0, 100.0, 100.0
+        self.velocity = min(10.0, build.max_velocity)
+        self.acceleration = self.deceleration = min(100.0, build.max_acceleration)
         self._servo = False
         self._clock = clock
         firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
