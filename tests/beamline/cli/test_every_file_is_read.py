@@ -19,6 +19,8 @@ from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 
+pytestmark = pytest.mark.slow  # half a minute for all pairs
+
 SCENE = """
 phantom:
   kind: solids

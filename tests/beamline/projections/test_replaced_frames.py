@@ -28,6 +28,7 @@ def clean(groups: int, n: int, scale: float = 1.0) -> float:
     return found
 
 
+@pytest.mark.slow
 @given(
     groups=st.integers(1, 3), kind=st.sampled_from((DARK, FLAT)), by=st.integers(0, 1), at=st.integers(0, 2),
     view=st.integers(0, VIEWS - 1), frame=st.integers(-1, 2),
