@@ -12,7 +12,7 @@ _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _BLURRED = 1.0  # voxels: of a reference, so that its noise does not decide which voxels are dense
 _SLAB = 32  # slices at a time
-_MOST = 2**22  # voxels at most that regions and their noise are computed from
+_MOST = 2**21  # voxels at most that regions and their noise are computed from
 _PART = 2**22  # values whose errors are summed at a time
 _RIM = 2  # voxels at the edge of a region, where its surroundings blur into it
 
@@ -151,7 +151,7 @@ def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
 
 
 def sampled(volume: Array) -> Array:
-    """Every k-th voxel along each axis, as a view, so that a large volume has at most 2^22 of them; else all."""
+    """Every k-th voxel along each axis, as a view, so that a large volume has at most 2^21 of them; else all."""
     steps = [1, 1, 1]
     while np.prod([-(-n // step) for n, step in zip(volume.shape, steps, strict=True)]) > _MOST:
         steps[int(np.argmax(np.divide(volume.shape, steps)))] += 1
