@@ -149,15 +149,12 @@ def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
     _, y, x = grid.coordinates()
     inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
     some, weights = _views_compared(prepared.geometry), prepared.ray_factors()
-    data, density = (
-        prepared.projections.data,
-        float(prepared.projections.data[some].mean()) / (grid.spacing[1] * y.size),
-    )
+    data = prepared.projections.data
+    density = float(np.mean([data[view].mean() for view in some])) / (grid.spacing[1] * y.size)
 
     def squares(of: float) -> float:
         cylinder = np.broadcast_to(np.where(inside, np.float32(of), np.float32(0)), grid.shape)
-        volume = Volume(np.ascontiguousarray(cylinder), grid)
-        return _residual(volume, data, prepared.geometry, some, weights, lambda done, count: None) ** 2
+        return _residual(Volume(cylinder, grid), data, prepared.geometry, some, weights, lambda done, count: None) ** 2
 
     # The squares are 1 - 2 b c + a c² of the density c.
     plus, minus = squares(density), squares(-density)
@@ -215,11 +212,11 @@ def _residual(
     bands = residual_bands(volume.grid, some, matter)
     for n, rows in enumerate(bands):
         part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)
-        lines = volume
+        lines = replace(volume, data=np.ascontiguousarray(volume.data)) if part is some else volume
         if part is not some:
             height = (part.middle_height, *volume.grid.centre[1:])
             grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
-            lines = Volume(volume.data[rows], grid)
+            lines = Volume(np.ascontiguousarray(volume.data[rows]), grid)
         known = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
         found, scale = residual_norms(lines, data[views, rows], part, known)
         left, total = left + found**2, total + scale**2
