@@ -1,12 +1,12 @@
-"""Single darks and flats that are none: lit, unlit, saturated, never written, or with the sample in the beam.
+"""Frames labelled dark or flat that cannot serve as one: lit, unlit, saturated, never written, or with the sample in.
 
 `beamline.monitor.references` judges groups as they are; here each frame is compared with its group, with the other
-groups, and with the views. A frame that is none would spoil the mean of its group, however good the others are.
+groups, and with the views. One such frame would spoil the mean of its group, however good the others are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +41,7 @@ Places = NDArray[np.float32]
 def without_odd(
     groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
 ) -> tuple[list[list[ReferenceFrame]], list[JudgedGroup]]:
-    """The groups without the frames that are none (without a group where none is left), and what these are.
+    """The groups without the frames that cannot serve, without groups that become empty, and what these frames are.
 
     A group with no good frame at all stays whole where its kind has no other: `judge` tells its fault.
 
@@ -52,14 +52,14 @@ def without_odd(
     limits = limits or ReferenceLimits()
     darks, flats = ([list(g) for g in groups if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
     odd: list[JudgedGroup] = []
-    darks = _split(darks, lambda: _unusable(darks, None, limits), odd)
-    darks = _split(darks, lambda: _lit_darks(darks, flats), odd)
-    flats = _split(flats, lambda: _unusable(flats, darks, limits), odd)
-    flats = _split(flats, lambda: _changed(flats, darks, limits), odd)
+    darks = _split(darks, _unusable(darks, None, limits), odd)
+    darks = _split(darks, _lit_darks(darks, flats), odd)
+    flats = _split(flats, _unusable(flats, darks, limits), odd)
+    flats = _split(flats, _changed(flats, darks, limits), odd)
     views = lit_views(views, darks)
     if views:
-        flats = _split(flats, lambda: _with_sample(flats, darks, views, single=True), odd)
-        flats = _split(flats, lambda: _with_sample(flats, darks, views, single=False), odd)
+        flats = _split(flats, _with_sample(flats, darks, views, single=True), odd)
+        flats = _split(flats, _with_sample(flats, darks, views, single=False), odd)
     return [*darks, *flats], odd
 
 
@@ -105,7 +105,7 @@ def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
 
 @dataclass(frozen=True)
 class _Odd:
-    """A frame that is none: the fault it has, its figure, the limit, and a sentence with {figures}."""
+    """A frame that cannot serve: its fault, the figure, the limit, and a sentence with {figures}."""
 
     frame: ReferenceFrame
     kind: FaultKind
@@ -114,11 +114,8 @@ class _Odd:
     said: str
 
 
-def _split(
-    groups: list[list[ReferenceFrame]], find: Callable[[], list[_Odd]], odd: list[JudgedGroup]
-) -> list[list[ReferenceFrame]]:
+def _split(groups: list[list[ReferenceFrame]], found: list[_Odd], odd: list[JudgedGroup]) -> list[list[ReferenceFrame]]:
     """The groups without the odd frames, which are added to the others; all of them, where none would be left."""
-    found = find()
     rows = {each.frame.row for each in found}
     left = [[frame for frame in group if frame.row not in rows] for group in groups]
     if not found or not any(left):
@@ -157,8 +154,8 @@ def _unusable(
             elif darks is not None and some and frame.saturated - hot > limits.saturated:
                 said = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
                 found.append(_Odd(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, said))
-    rows: set[int] = set()
-    return [each for each in found if each.frame.row not in rows and not rows.add(each.frame.row)]  # type: ignore[func-returns-value]
+    first_of_row = {each.frame.row: each for each in reversed(found)}
+    return list(reversed(first_of_row.values()))
 
 
 def _varies(frame: ReferenceFrame) -> bool:

@@ -6,7 +6,7 @@ of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 
 largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave*
 each.
 
-A track is none of the sample's if no point that turns with the stage within the sample's radius explains it: the
+A track does not belong to the sample if no point that turns with the stage within its radius explains it: the
 difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
 
 Lengths are cells, times are views.

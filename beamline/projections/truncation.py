@@ -47,6 +47,6 @@ def cut_said(sides: dict[str, float]) -> str:
     return (
         f"The sample goes on beyond the {' and '.join(sides)} edge of the field (line integral "
         f"{max(sides.values()):.2f} there). What lies outside is not seen by all views: values inside are relative, "
-        "not absolute, and those at the rim are uncertain. FBP takes views to fade out beyond the edge; the edges are "
-        "not taken for air. If they are air, and the beam is weaker than its flats, give --air columns."
+        "not absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
+        "columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
     )
