@@ -8,8 +8,9 @@ noise. In the mean of thousands of pixels they are a hundred times its noise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +18,6 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
-from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame
 
@@ -39,7 +39,23 @@ CALIBRATION = 24  # views
 LEAST_NOISE = 3e-4
 MEMORY, OUTLIER = 0.03, 3.0
 PEAK = 5.0
-RULES = Rules(span=10, least=4, share=0.6, total=0.0, rows=0.0, cols=2.5, slack=0.15)
+SPAN, LEAST, SHARE = 10, 4, 0.6  # views that a trail takes at most, has a peak in at least, and what share has one
+OFF, SLACK = 2.5, 0.15  # broad columns: from a peak to its trail; a view, added to the sample's speed
+
+
+class Peak(NamedTuple):
+    """The highest output in a view: its broad column, and its score with its sign."""
+
+    view: int
+    col: float
+    score: float
+
+
+class Trail(NamedTuple):
+    """Peaks on a straight line in time, faster than the sample could carry them: first view, broad columns a view."""
+
+    first: int
+    speed: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +65,7 @@ class GhostState:
     filters: Filters | None = None  # for the angle's `step` in radians
     step: float = math.nan
     usual: CellValues | None = None  # usual output of the filters at each column, None before the first
-    peaks: Peaks = field(default_factory=no_peaks)  # the highest of each of the last views
+    peaks: tuple[Peak, ...] = ()  # of the last views, oldest first
 
 
 @dataclass(frozen=True)
@@ -106,16 +122,16 @@ class GhostCheck:
         scores = outputs / np.maximum(usual, 1.0)
         signal, col = np.unravel_index(np.abs(scores).argmax(), scores.shape)
         score, depth = float(scores[signal, col]), float(outputs[signal, col] / state.filters.strength[signal])
-        old = state.peaks[state.peaks[:, 0] >= now - RULES.span]
+        old = tuple(peak for peak in state.peaks if peak.view >= now - SPAN)
         usual = usual + np.float32(MEMORY) * (np.minimum(spread, OUTLIER * usual) - usual)
         state = replace(state, usual=usual, peaks=old)
         if abs(score) <= PEAK or abs(depth) <= self.warn:
             return Look(state)
         if np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) <= ALIKE:
             return Look(state)
-        new = np.array([[now, 0.0, col, score]])
-        state = replace(state, peaks=np.concatenate([old, new]))
-        trail = best_trail(old, new, RULES, (COLUMNS - 1) / 2, FASTER * turn, COLUMNS / 2)
+        peaks = (*old, Peak(now, float(col), score))
+        state = replace(state, peaks=peaks)
+        trail = best_trail(peaks, FASTER * turn)
         if trail is None:
             return Look(state)
         light = abs(math.expm1(-depth))
@@ -129,7 +145,7 @@ class GhostCheck:
             "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
             + again_by(self.name)
         )
-        return Look(state, Flag(self.name, level, now, light, limit, advice, region, int(trail.first)))
+        return Look(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
 
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
@@ -166,3 +182,25 @@ def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
     made = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
     keep = made.strength * 2 * limit > SHOWS
     return Filters(made.weights[keep], made.strength[keep], made.speeds[keep])
+
+
+def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
+    """The trail with the largest sum of scores that ends at the last of the peaks, one a view, if there is one.
+
+    A point of the sample at x from the middle moves by less than turn sqrt(radius² - x²) a view, `turn` in radians a
+    view; x and radius, half the field, are in broad columns.
+    """
+    best, most, last = None, 0.0, peaks[-1]
+    alike = [peak for peak in peaks if peak.score * last.score > 0]
+    for first in alike:
+        age = last.view - first.view
+        if age < LEAST - 1:
+            break
+        speed, beside = (last.col - first.col) / age, (last.col + first.col - COLUMNS + 1) / 2
+        if abs(speed) < turn * math.sqrt(max((COLUMNS / 2) ** 2 - beside**2, 0.0)) + SLACK:
+            continue
+        since = [peak for peak in alike if peak.view >= first.view]
+        near = [abs(p.score) for p in since if abs(p.col - (last.col - speed * (last.view - p.view))) <= OFF]
+        if len(near) >= max(LEAST, SHARE * (age + 1)) and (total := sum(near)) > most:
+            best, most = Trail(first.view, speed), total
+    return best

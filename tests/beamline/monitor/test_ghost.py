@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.ghost import GhostCheck
+from beamline.monitor.ghost import COLUMNS, GhostCheck, Peak, best_trail
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs, blob
 
 BEGINS = 50
@@ -62,3 +62,37 @@ def test_dense_fog_is_an_alarm() -> None:
 )
 def test_other_changes_are_none(change: Any) -> None:
     assert only(Blobs(120, counts=change)) == []
+
+
+TURN = 0.016  # radians a view: the middle of the sample moves by at most a quarter of a broad column
+
+
+def line(speed: float, views: range, *, col: float = 10.0, score: float = 6.0) -> list[Peak]:
+    return [Peak(view, col + speed * view, score) for view in views]
+
+
+@pytest.mark.parametrize("speed", [0.9, -0.7, 5.0])
+def test_a_trail_begins_at_its_first_peak_and_is_as_fast(speed: float) -> None:
+    trail = best_trail(line(speed, range(6)), TURN)
+    assert trail is not None and trail.first == 0 and trail.speed == pytest.approx(speed)
+
+
+@pytest.mark.parametrize(
+    "peaks",
+    [
+        line(0.2, range(8)),  # as slow as the sample
+        line(0.9, range(3)),  # too few
+        line(0.9, range(0, 10, 3)),  # too rarely
+        [*line(0.9, range(3)), *line(0.9, range(3, 6), col=30.0)],  # elsewhere
+        [*line(0.9, range(3)), *line(0.9, range(3, 6), score=-6.0)],  # of the other sign
+    ],
+    ids=["slow", "few", "rare", "elsewhere", "sign"],
+)
+def test_other_peaks_are_none(peaks: list[Peak]) -> None:
+    assert best_trail(peaks, TURN) is None
+
+
+def test_near_the_samples_rim_the_limit_falls() -> None:
+    """Its points there move along the beam."""
+    assert best_trail(line(0.35, range(8)), TURN) is None
+    assert best_trail(line(0.35, range(8), col=COLUMNS - 2.5), TURN) is not None
