@@ -70,9 +70,6 @@ def _compiling() -> Iterator[None]:
             yield
 
 
-REPORT = "report.html"
-
-
 def _keep_bytecode() -> None:
     """Write the bytecode of what is imported, also where the environment asks for none: README installs without it.
 
@@ -133,7 +130,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     from beamline.projections.selection import Selection
     from beamline.reconstruct.model import read_model
     from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
-    from beamline.reconstruct.output_paths import OutputPaths
+    from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.reconstruct.parameters import axis_of
     from beamline.reconstruct.result import write_result
     from beamline.report.record import history_from
@@ -159,7 +156,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         gaussians=read_model(folder / RECON).gaussians if record.model else None,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes],
     )
-    target = OutputPaths(folder / RECON, folder / REPORT, replace=True)
+    target = OutputPaths(folder / RECON, report_beside(folder / RECON), replace=True)
     live = target.live_picture.name if target.live_picture.exists() else ""
     context = ReportContext(
         facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live

@@ -15,6 +15,7 @@ from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
+from beamline.core.files import REPORT
 from beamline.study.studies import STUDIES
 from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
@@ -116,7 +117,7 @@ def study(
         table = run_study(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
-        click.echo(f"\n{'report':<10}{folder / 'report.html'}")
+        click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
         rows = sum(cell.row.groups is not None for cell in table.cells)
         raise ScanStopped(f"The study was stopped after {len(table.done)} of {rows} rows; {folder} holds those.")

@@ -20,7 +20,7 @@ from beamline.scan.run_folder import RECON, SCAN
 from beamline.scan.runs import DIED
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
-from beamline.storage.writer_lock import QUIET, held
+from beamline.storage.writer_lock import abandoned
 
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
@@ -127,7 +127,7 @@ class Reader:
                 self._seen = frames, now
             age = now - self._seen[1]
         volume = newest(self.what.volumes)
-        died = status == "running" and not held(self.what.scan) and now - self.what.scan.stat().st_mtime > QUIET
+        died = status == "running" and abandoned(self.what.scan)
         return {
             "frames": frames,
             "status": DIED if died else status,

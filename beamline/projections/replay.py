@@ -21,7 +21,7 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
-from beamline.storage.writer_lock import held
+from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 
@@ -29,7 +29,6 @@ BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line i
 SAMPLES = 4  # frames of a kind that tell where the detector saturates
 PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
 POLL = 0.1  # s between looks at a growing file
-PATIENCE = 120.0  # s without a new frame, after which a growing file is given up
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +138,8 @@ def frames_of(
 
     A view that was taken again later has the kind that it had when it came.
     """
-    done, waited = 0, 0.0
+    done = 0
+    writer = None if follow is None else WriterWatch(source.path, follow.now())
     while True:
         ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
         n = source.refresh()
@@ -152,16 +152,12 @@ def frames_of(
             yield frame, n
         if ended:
             return
-        assert follow is not None
-        waited = 0.0 if n > done else waited + POLL
+        assert follow is not None and writer is not None
+        if why := writer.lost(follow.now(), n > done, lambda: source.finished):
+            raise DataError(
+                f"{source.path} {why} and is not finished; its {n} frames were looked at. {next_step(source.path)}"
+            )
         done = n
-        if waited > PATIENCE:
-            if not held(source.path):
-                raise DataError(
-                    f"{source.path} has not grown for {PATIENCE:.0f} s and is not finished; its {n} frames were looked "
-                    f"at. {next_step(source.path)}"
-                )
-            waited = 0.0  # the writer waits: for the operator, the beam, or a long exposure
         follow.sleep(POLL)
 
 

@@ -15,14 +15,14 @@ from typing import Any, Literal, Self, get_args
 
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, VolumeDone, Warned, event_of
-from beamline.core.files import named_on_failure, remove, whole_file
+from beamline.core.files import RECON, named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.base.clock import Clock
 
 RowState = Literal["waiting", "done", "poor", "failed"]
 
-TABLE, RECIPE, VOLUME = "batch.csv", "recipe.yaml", "recon.h5"
+TABLE, RECIPE = "batch.csv", "recipe.yaml"
 _WORKER_LOG = ".worker.txt"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
 COMMAND = (sys.executable, "-m", "beamline.cli.recon_worker")
@@ -243,14 +243,14 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
             sink(replace(event, scan=row.scan))
 
     place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
-    if (place / VOLUME).is_file():
+    if (place / RECON).is_file():
         return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
     remove(work)  # of a batch that was killed
     try:
         with named_on_failure(work):
             work.mkdir()
         code, stderr = worker.run(_arguments(options, row.scan, work), pass_on)
-        state = _WITH_VOLUME.get(code, "failed") if (work / VOLUME).is_file() else "failed"
+        state = _WITH_VOLUME.get(code, "failed") if (work / RECON).is_file() else "failed"
         if state != "failed":
             with named_on_failure(place):
                 work.replace(place)
@@ -270,7 +270,7 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
 
 def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
     recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-    return ["recon", scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
+    return ["recon", scan, *recipe, "--output", str(work / RECON), "--log", str(work / "log.txt"), "--json"]
 
 
 def _read(folder: Path) -> list[BatchRow]:

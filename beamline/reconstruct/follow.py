@@ -18,14 +18,13 @@ from beamline.reconstruct.progress import compilation_events
 from beamline.reconstruct.result import write_result
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource
-from beamline.storage.writer_lock import held
+from beamline.storage.writer_lock import PATIENCE, WriterWatch
 from drivers.base.clock import Clock
 from recon.base.views import parse_views
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 DEFAULT_SECONDS = 20.0  # of the last round
-_LOOK = 1.0  # s between looks whether the writer still holds its lock
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class FollowTiming:
     poll: float = 0.1
     slice: float = 0.25
     snapshot: float = 5.0
-    patience: float = 120.0
+    patience: float = PATIENCE
 
 
 def follow(
@@ -141,26 +140,18 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_sto
     Raises:
         DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
     """
-    last_frame = last_snapshot = last_look = clock.now()
-    was_locked = locked = held(growing.source.path)
+    last_snapshot = clock.now()
+    writer = WriterWatch(growing.source.path, last_snapshot, rhythm.patience)
     while True:
         ended = growing.source.finished  # asked before the frames, so that none is missed
-        if growing.take_new_frames(ended):
-            last_frame = clock.now()
+        grew = growing.take_new_frames(ended)
         if ended:
             return True
         if should_stop() and not growing.source.finished:
             if not growing.has_volume:
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False
-        now = clock.now()
-        if now - last_look >= _LOOK:
-            last_look, was_locked, locked = now, locked, held(growing.source.path)
-        if locked and now - last_frame > rhythm.patience:
-            last_frame = now  # the writer waits: for the operator, the beam, or a long exposure
-        gone = was_locked and not locked and not growing.source.finished  # the lock goes after the end is written
-        if gone or now - last_frame > rhythm.patience:
-            why = "has lost its writer" if gone else f"has not grown for {rhythm.patience:.0f} s"
+        if why := writer.lost(clock.now(), grew, lambda: growing.source.finished):
             raise DataError(
                 f"{growing.source.path} {why} and is not finished. {next_step(growing.source.path)} Without --follow "
                 f"and with --unfinished the {growing.n_views} views that are there are used."

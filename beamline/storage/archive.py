@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import run_of, whole_file
 from beamline.core.text import count, spans
 from beamline.monitor.digest import checksum_of, has_checksum
 from beamline.storage import hdf5
 from beamline.storage.codecs import filter_of
-from beamline.storage.parts import joined_file_of, other_parts
+from beamline.storage.parts import joined_file_of, other_parts, to_join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import altered_said
 from beamline.storage.superblock import superblock
@@ -132,7 +132,7 @@ def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
     if others := other_parts(scan):
         raise DataError(
             f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
-            "`beamline recover RUN` joins them; then archive joined.h5. Nothing was written."
+            f"{to_join(run_of(scan.resolve().parent))}; then archive joined.h5. Nothing was written."
         )
     return frames, altered, said
 

@@ -7,7 +7,6 @@ import errno
 import os
 import re
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -25,7 +24,7 @@ from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import superblock
-from beamline.storage.writer_lock import QUIET, LockFailure, held, held_sentence, lock_failure, opened_whole
+from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
 DEGREE = np.pi / 180
 ANGLE_UNITS = {
@@ -71,7 +70,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         return h5py.File(Overlay(path, changes.ranges), "r")
     problems, is_held = [], False
     head = superblock(path)
-    if grows_here(path) or (head is not None and head.grows and _died(path)):
+    # HDF5 would wait for ever for a writer that died to mend a torn block.
+    if grows_here(path) or (head is not None and head.grows and abandoned(path)):
         return _apart(path, follow)
     missing = 0 if head is None else head.missing
     being_written = head is not None and head.open_for_writing and head.intact
@@ -125,11 +125,6 @@ def grows_here(path: Path) -> bool:
             if os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
                 return True
     return False
-
-
-def _died(path: Path) -> bool:
-    """Whether no program seems to write the file. HDF5 would wait for ever for one that mends a torn block."""
-    return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:

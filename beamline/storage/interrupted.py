@@ -11,9 +11,9 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import CONFIG, EVENTS, RECON, SCAN, parts_of, run_of
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, may_hold_frames, views_in, views_planned
+from beamline.storage.parts import JOINED, may_hold_frames, to_join, views_in, views_planned
 from beamline.storage.superblock import superblock
-from beamline.storage.writer_lock import QUIET, held
+from beamline.storage.writer_lock import abandoned, held
 
 
 def scan_file(path: str | Path) -> Path:
@@ -31,8 +31,8 @@ def scan_file(path: str | Path) -> Path:
         return path / JOINED
     parts = [part / SCAN for part in parts_of(path) if may_hold_frames(part / SCAN)]
     if len(parts) > 1:
-        join = f"`beamline recover {path}` joins them."
-        raise DataError(f"{path} has {len(parts)} parts that are not joined. {next_step(parts[-1]) or join}")
+        step = next_step(parts[-1]) or f"{to_join(path)}."
+        raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
     return path / SCAN
 
 
@@ -73,9 +73,9 @@ def next_step(scan: Path) -> str:
     if held(scan):
         watch = "" if run is None else f"`beamline watch {run}` shows it, "
         return f"Its scan still runs: {watch}`beamline recon {scan} --follow` reconstructs it meanwhile."
-    age = time.time() - scan.stat().st_mtime
     died = "Its scan has died"
-    if age < QUIET:  # where the disk has no locks, its program may run
+    if not abandoned(scan):  # where the disk has no locks, its program may run
+        age = time.time() - scan.stat().st_mtime
         died += f", unless the program that wrote to it {age:.0f} s ago still runs"
     what = scan if run is None else run
     recover = f"`beamline recover {what}` makes an ordinary file of the frames that are there"

@@ -154,6 +154,11 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
     return None
 
 
+def to_join(run: Path) -> str:
+    """How the parts of a run become one file, as the end of a sentence."""
+    return f"`beamline recover {run}` joins the parts that are there"
+
+
 def require_joined(file: h5py.File) -> None:
     """DataError if a joined file draws frames from changed parts, or lacks a part.
 
@@ -164,8 +169,8 @@ def require_joined(file: h5py.File) -> None:
     joined = Path(file.filename)
     if why := _disagreement(file, joined.parent):
         raise DataError(
-            f"{joined} does not have the frames of its scan: {why}. `beamline recover {joined.parent}` joins the parts "
-            "that are there; where parts are elsewhere, copy the folder of the run as a whole. Nothing was changed."
+            f"{joined} does not have the frames of its scan: {why}. {to_join(joined.parent)}; where parts are "
+            "elsewhere, copy the folder of the run as a whole. Nothing was changed."
         )
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.core.files import RECON
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
@@ -104,7 +105,7 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
         item for item in path.iterdir() if item.suffix.lower() in (".tif", ".tiff") and not item.name.startswith(".")
     ]
     if not files:
-        inside = [path / name for name in ("recon.h5", "volume.h5") if (path / name).is_file()]
+        inside = [path / name for name in (RECON, "volume.h5") if (path / name).is_file()]
         raise DataError(
             f"{path} is a folder without TIFF slices"
             + (

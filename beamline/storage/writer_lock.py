@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
 from pathlib import Path
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
     import h5py
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
+
+PATIENCE = 120.0  # s without a new frame, after which a growing file without the lock of its writer is given up
+_LOOK = 1.0  # s between looks whether the writer still holds its lock
 
 _TRIES, _PAUSE = 20, 0.005  # real s between tries for a shared lock
 
@@ -153,3 +157,38 @@ def held(path: Path) -> bool:
     finally:
         os.close(file)
     return False
+
+
+def abandoned(path: Path) -> bool:
+    """Whether no program seems to write the file: it has not changed for QUIET s, and no program that runs holds it."""
+    return time.time() - path.stat().st_mtime > QUIET and not held(path)
+
+
+class WriterWatch:
+    """Tells who follows a growing file that its writer is gone: at once by the lock, or else by its silence.
+
+    Args:
+        now: s, by the clock of the follower.
+        patience: s without a frame, after which a file without a lock counts as one whose writer died. With the lock
+            the writer waits: for the operator, the beam, or a long exposure.
+    """
+
+    def __init__(self, path: Path, now: float, patience: float = PATIENCE) -> None:
+        self._path, self._patience = path, patience
+        self._last_frame = self._last_look = now
+        self._was_held = self._held = held(path)
+
+    def lost(self, now: float, grew: bool, finished: Callable[[], bool]) -> str:
+        """What shows that the writer is gone, as the end of a sentence; "" while it is not.
+
+        Args:
+            grew: since the last call.
+            finished: asks the file; the lock goes after the end is written.
+        """
+        if now - self._last_look >= _LOOK:
+            self._last_look, self._was_held, self._held = now, self._held, held(self._path)
+        if grew or (self._held and now - self._last_frame > self._patience):
+            self._last_frame = now
+        if self._was_held and not self._held and not finished():
+            return "has lost its writer"
+        return f"has not grown for {self._patience:.0f} s" if now - self._last_frame > self._patience else ""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from beamline.core.files import write_whole
+from beamline.core.files import REPORT, write_whole
 from beamline.core.machine import machine_line
 from beamline.projections.scan_statistics import dose_scale
 from beamline.report.figures import DPI, WIDTH, png
@@ -98,4 +98,4 @@ def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
         scan=table.scan,
         command=table.command,
     )
-    write_whole(folder / "report.html", page, replace=True)
+    write_whole(folder / REPORT, page, replace=True)

@@ -18,7 +18,7 @@ from beamline.core.text import count, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.interrupted import next_step
-from beamline.storage.parts import is_joined, joined_file_of, other_parts
+from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding, Severity
@@ -462,9 +462,7 @@ def parts_joined(source: ScanSource) -> Iterator[Finding]:
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
     elif others := other_parts(source.path):
         said = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
-        yield Finding(
-            "warning", "parts", f"{said}: `beamline recover {run_of(source.path.resolve().parent)}` joins them."
-        )
+        yield Finding("warning", "parts", f"{said}: {to_join(run_of(source.path.resolve().parent))}.")
 
 
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (

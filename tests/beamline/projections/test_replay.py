@@ -13,7 +13,6 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
-from beamline.projections import replay as module
 from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -86,7 +85,7 @@ class Waits:
         self.scan, self.n = scan, 0
 
     def now(self) -> float:
-        return 0.0
+        return 20.0 * self.n
 
     def sleep(self, seconds: float) -> None:
         self.n += 1
@@ -94,8 +93,7 @@ class Waits:
 
 
 @pytest.mark.parametrize("close", [True, False])
-def test_a_growing_file_is_followed_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, close: bool) -> None:
-    monkeypatch.setattr(module, "PATIENCE", 1.0)
+def test_a_growing_file_is_followed_to_its_end(tmp_path: Path, close: bool) -> None:
     frames = frames_of(SCAN)
     frames[9] = replace(frames[9], counts=frames[8].counts)
     scan = _grow(tmp_path / "s.h5", frames, close)
