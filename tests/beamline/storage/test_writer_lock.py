@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.writer_lock import QUIET, WriterLock, WriterWatch, abandoned, held
 
 
 def test_a_file_is_held_until_its_lock_is_released(tmp_path: Path) -> None:
@@ -35,4 +37,31 @@ def test_an_exclusive_lock_is_refused_at_once(tmp_path: Path) -> None:
     lock = WriterLock(tmp_path / "a")
     with pytest.raises(OSError):
         WriterLock(tmp_path / "a", exclusive=True)
+    lock.release()
+
+
+def test_a_writer_that_gives_up_its_lock_is_gone_at_once_unless_it_finished(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    lock = WriterLock(tmp_path / "a")
+    watch = WriterWatch(tmp_path / "a", 0.0, patience=10.0)
+    assert not any(watch.lost(now, False, lambda: False) for now in (5.0, 50.0, 500.0))  # it waits, and has the lock
+    lock.release()
+    assert not watch.lost(502.0, False, lambda: True)
+    assert watch.lost(502.5, False, lambda: False) == "has lost its writer"
+
+
+def test_a_writer_without_a_lock_is_gone_when_no_frame_comes(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    watch = WriterWatch(tmp_path / "a", 0.0, patience=10.0)
+    assert not watch.lost(9.0, True, lambda: False) and not watch.lost(18.0, False, lambda: False)
+    assert watch.lost(19.5, False, lambda: False) == "has not grown for 10 s"
+
+
+def test_a_file_is_abandoned_when_it_is_quiet_and_not_held(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    assert not abandoned(tmp_path / "a")
+    os.utime(tmp_path / "a", (time.time() - 2 * QUIET,) * 2)
+    assert abandoned(tmp_path / "a")
+    lock = WriterLock(tmp_path / "a")
+    assert not abandoned(tmp_path / "a")
     lock.release()
