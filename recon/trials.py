@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.lost_mass import compare
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32, F64, median_deviation
 from recon.base.binning import bin_views
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
-from recon.base.noise import median_deviation
 from recon.base.volume import Grid, Volume
 from recon.voxels.held_out_weight import (
     LEAST_VIEWS,

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from beamline.core.jit import njit
 from beamline.monitor.view import CellGrid, CellValues, CellView
+from recon.base.arrays import MEDIAN
 
 SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
@@ -145,7 +146,7 @@ def _deviation(change: CellValues, usual: float, weight: CellValues) -> tuple[Ce
     """Deviations from the usual value, and their standard deviation by the median; None where no cell has a weight."""
     deviation, sample = np.empty_like(change), np.empty(change.size, np.float32)
     n = _deviate(change, usual, weight, deviation, sample)
-    return deviation, 1.4826 * _median(sample[:n]) if n else None
+    return deviation, _median(sample[:n]) / MEDIAN if n else None
 
 
 def _median(values: CellValues) -> float:

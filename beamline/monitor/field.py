@@ -14,6 +14,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_ed
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT, CellGrid
 from drivers.base.frame import Frame, FrameKind
+from recon.base.arrays import median_deviation
 
 LASTS = 5  # views in a row with matter at an edge
 NO_BEAM = 3.0  # times the noise: a flat's bright part below this has no light; noise alone gives 1.3
@@ -103,9 +104,7 @@ class FieldOfViewCheck:
 
 def _noise(light: NDArray[np.float32]) -> float:
     """Standard deviation of a block, from the differences of neighbours in a row: the beam's shape is smooth."""
-    return (
-        1.4826 * float(np.median(np.abs(np.diff(light[::2], axis=1)))) / math.sqrt(2.0) if light.shape[1] > 1 else 0.0
-    )
+    return median_deviation(np.diff(light[::2], axis=1)) / math.sqrt(2.0)
 
 
 def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:

@@ -20,6 +20,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame
+from recon.base.arrays import median_deviation
 
 COLUMNS = 32  # broad columns of the field
 PARTS = 8  # of the rows
@@ -163,7 +164,7 @@ def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
     """Noise of a profile, including unsteady changes of the sample: from second differences over `stride` views."""
     seen = np.stack([profile.mean(axis=0) for profile in profiles])
     second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
-    return max(1.4826 * float(np.median(np.abs(second))) / math.sqrt(6.0), LEAST_NOISE)
+    return max(median_deviation(second) / math.sqrt(6.0), LEAST_NOISE)
 
 
 def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:

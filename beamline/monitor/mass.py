@@ -15,6 +15,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_ed
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import AIR, brightest_place
 from drivers.base.frame import Frame
+from recon.base.arrays import median_deviation
 
 CALIBRATION = 10  # projections
 SIGMAS = 6.0
@@ -80,6 +81,5 @@ def _calibrate(state: MassState, mass: float) -> MassState:
     if len(masses) < CALIBRATION:
         return replace(state, masses=masses)
     usual = float(np.median(masses))
-    deviation = float(np.median(np.abs(np.array(masses) - usual)))
-    scatter = 1.4826 * deviation / usual if usual > 0 else 0.0  # MAD of a normal distribution to its sigma
+    scatter = median_deviation(np.array(masses) - usual) / usual if usual > 0 else 0.0
     return replace(state, masses=masses, usual=usual, scatter=scatter)

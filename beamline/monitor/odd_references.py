@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
-    NORMAL,
     UNLIT,
     WORST,
     FaultKind,
@@ -26,6 +25,7 @@ from beamline.monitor.references import (
     ReferenceLimits,
 )
 from drivers.base.frame import FrameKind
+from recon.base.arrays import MEDIAN, median_deviation
 
 LIT = 0.02  # share of the flats' light from which a dark is lit: 0.02 of transmission, if it were the only dark
 BLOCK_SIGMAS = 3.0  # noises of a block that the level of a dark may move beside that: readout drifts with its noise
@@ -203,7 +203,7 @@ def _changed(
         levels = np.nanmedian(ratio, axis=1)
         local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
         place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
-        noise = NORMAL * float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1)))
+        noise = float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1))) / MEDIAN
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2
         flickers, changed = [], []
@@ -319,8 +319,7 @@ def _beyond_noise(values: Places) -> float:
 def _noise_of(values: Places) -> float:
     """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
     change = np.diff(values, 2, axis=-1)
-    change = change[np.isfinite(change)]
-    return NORMAL * float(np.median(np.abs(change))) / 6**0.5 if change.size else 0.0
+    return median_deviation(change) / 6**0.5
 
 
 def _level(frame: ReferenceFrame) -> float:

@@ -18,8 +18,8 @@ from pydantic import Field
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest, thinned
 from drivers.base.frame import FrameKind
+from recon.base.arrays import median_deviation
 
-NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 LEAST_NOISE = 0.5  # counts: what rounding hides
 READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
 FEW = 20.0  # noises of the darks: flats with less light have hardly more noise, so that their variance tells nothing
@@ -259,7 +259,7 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     ratio = light[:, lit] / mean[lit]
     levels = np.median(ratio, axis=1)
     local = np.abs(ratio / levels[:, None] - 1)
-    noise = NORMAL * np.median(local)
+    noise = median_deviation(local)
     level = float(np.ptp(levels))
     place = float(np.percentile(local, WORST, axis=1).max())
     if level > limits.uneven:
@@ -342,4 +342,4 @@ def _noise(group: Group) -> float:
         before, after = (np.stack([r.blocks for r in part]) for part in (group[:-1], group[1:]))
         change, pairs = after - before, 2.0
         change = change - np.nanmedian(change, axis=(1, 2), keepdims=True)
-    return float(NORMAL * np.nanmedian(np.abs(change)) / np.sqrt(pairs) * group[0].block)
+    return median_deviation(change) / pairs**0.5 * group[0].block

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from beamline.core.jit import njit
 from beamline.monitor.view import CellValues
+from recon.base.arrays import median_deviation
 
 SEED = 4  # steps of an octave whose sum shows where a track may go on
 SLOWEST, SLOW = 1.5, 4.0  # cells a step: what moves less is mostly taken off with the neighbours; more, in views of one
@@ -157,7 +158,7 @@ def _change(before: CellValues, own: CellValues, after: CellValues, weight: Cell
     change, smooth = np.empty_like(own), np.empty_like(own)
     sample = np.empty(own.size // SAMPLED + own.shape[0], np.float32)
     n = _second(before, own, after, weight, np.float32(np.inf), change, sample)
-    noise = max(1.4826 * float(np.median(sample[:n])) if n else 1.0, LEAST_NOISE)
+    noise = max(median_deviation(sample[:n]) if n else 1.0, LEAST_NOISE)
     _second(before, own, after, weight, np.float32((SPIKE * noise) ** 2), change, sample)
     _take_common(change, weight, np.float32(OUTLIER * noise), COMMON)
     _smooth(change, KERNEL, KERNEL_ROWS if own.shape[0] >= KERNEL_ROWS.size else ONE, smooth)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.jit import njit
+from recon.base.arrays import median_deviation
 
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
@@ -172,7 +173,7 @@ def _places(image: CellValues, down: int, across: int) -> CellValues:
 def cell_noise(depth: CellValues, weight: CellValues) -> float:
     """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
     third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
-    return 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
+    return median_deviation(third) / math.sqrt(20.0)
 
 
 def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, CellValues, CellValues]:

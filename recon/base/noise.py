@@ -12,10 +12,9 @@ from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.signal import find_peaks
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 
-_MEDIAN = 0.6745  # median of |x| for a normal variable x with standard deviation 1
 _VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
@@ -121,12 +120,6 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
             if abs(views * steps.mean() - period) < _EVEN * period / views:
                 return order[:views]
     return None
-
-
-def median_deviation(images: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of a normal variable with the same median of absolute values."""
-    finite = images[np.isfinite(images)]
-    return float(np.median(np.abs(finite))) / _MEDIAN if finite.size else 0.0
 
 
 def ring_offsets(residual: F32, axis_col: float) -> F32:

@@ -7,6 +7,8 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import median_deviation
+
 _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
 _FEWEST = 5  # with fewer views there is no warning
 _OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels
@@ -89,7 +91,7 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     air = levels + beside >= np.median(levels + beside)  # a sample may reach the others
     beam = float(np.median(levels[air]))
     scatter = edges[air] - levels[air, None, None]
-    noise = 1.4826 * float(np.nanmedian(np.abs(scatter)))
+    noise = median_deviation(scatter)
     lowest, highest = np.nanquantile(some, (0.001, 0.9))
     if (np.abs(levels[air] - 1) > _LEVEL).any() or lowest < -_NOT_ABOVE - _SIGMAS * noise:
         return False

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from recon.base.arrays import F32, F64, Mask
+from recon.base.arrays import F32, F64, Mask, median_deviation
 from recon.base.binning import bin_views, factor_within
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -43,7 +43,7 @@ _MEAN = len(powers(ORDER))
 _VOXELS, _VIEWS = 2**15, 120  # at most; surfaces of the second order need no more
 _ONE_IN = 6  # views held out
 _STEPS, _LEAST = 25, 0.04  # of conjugate gradients; share of a combination that no volume holds
-_MAD, _CLIPPED, _ROBUST = 1.4826, 4.0, 4  # normal over median deviation; deviations; rounds
+_CLIPPED, _ROBUST = 4.0, 4  # standard deviations, rounds
 _TV_WEIGHT = 3e-4  # more takes mass from the sample, which the terms would take up
 _FIRST, _SWEEPS, _ROUNDS = 9, 3, 24
 _DENSE, _LONGEST = 0.2, 10.0  # of the density unit; factor of a step
@@ -264,7 +264,7 @@ def _of_no_volume(views: _Views, progress: Callable[[int], object]) -> F64:
         kept = combinations[:, shares > _LEAST] / shares[shares > _LEAST] ** 0.5
         found = kept @ (kept.T @ (terms.T @ (weight * data)))
         off = np.abs(data - terms @ found)
-        weight = known * (off <= _CLIPPED * _MAD * np.median(off[known > 0]))
+        weight = known * (off <= _CLIPPED * median_deviation(off[known > 0]))
     return np.asarray(found)
 
 
@@ -315,5 +315,5 @@ def _fitted(image: F32, basis: F64, used: Mask) -> F64:
     for _ in range(_ROBUST):
         found = np.asarray(np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0])
         off = np.abs(values - basis @ found)
-        kept = used & (off <= _CLIPPED * _MAD * np.median(off[used]))
+        kept = used & (off <= _CLIPPED * median_deviation(off[used]))
     return np.asarray(found)

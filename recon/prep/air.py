@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 
-_MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _NEXT, _OUTER = 5, 3  # views next to flats; columns
 _RISE = 0.005  # line integral, from the edge to an eighth of the width: about the least a surface of the beam has
 _BANDS = 8  # of rows, at most
@@ -42,7 +41,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         level = np.median(profile[:, :, :3], axis=(1, 2))
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
         wide = profile.shape[2] > 1
-        noise = _MAD * float(np.median(np.abs(np.diff(relative, axis=2)))) / np.sqrt(2) if wide else 0.0
+        noise = median_deviation(np.diff(relative, axis=2)) / np.sqrt(2) if wide else 0.0
         # One view in twenty may deviate: noise has tails, and the median over the columns tolerates it.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)

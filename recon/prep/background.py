@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from recon.base.arrays import F32, F64, Mask
+from recon.base.arrays import F32, F64, Mask, median_deviation
 from recon.base.noise import air_level
 
 HIGHEST = 3  # Order of the polynomials in column and row, at most
@@ -21,7 +21,7 @@ LEAST_SIZE = 0.005  # Root mean square of the surfaces, in line integrals, from 
 
 _SMOOTH = 1.5  # voxels; smoothing raises weak matter above the noise
 _SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter
-_MAD, _CLIPPED = 1.4826, 4.0  # normal standard deviation over median deviation; such deviations
+_CLIPPED = 4.0  # standard deviations
 _BLOCK = 8  # pixels a side: every other block of air is predicted from those between
 _LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # share of the rays of a view; share of the views
 _WINDOWS = (45, 15, 5, 1)  # views that share a surface
@@ -184,7 +184,7 @@ class AirSums:
         if p.size < 2 * t.shape[1]:
             return air
         left = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
-        spread = _MAD * float(np.median(np.abs(left[air])))
+        spread = median_deviation(left[air])
         return np.asarray(air & (np.abs(left) <= _CLIPPED * max(spread, 1e-12)))
 
 

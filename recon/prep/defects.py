@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import Mask
+from recon.base.arrays import MEDIAN, Mask, median_deviation
 from recon.base.masks import NEIGHBOURS, Image
 
-_MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
 SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
@@ -38,9 +37,8 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
 
     def outliers(image: Image, least: float) -> Mask:
         filled = np.where(dead, np.median(image[~dead]), image)
-        difference = np.abs(filled - ndimage.median_filter(filled, 3, mode="nearest"))
-        sigma = max(_MAD * float(np.median(difference)), least)
-        return difference > hot_threshold * sigma
+        difference = filled - ndimage.median_filter(filled, 3, mode="nearest")
+        return np.abs(difference) > hot_threshold * max(median_deviation(difference), least)
 
     # Smaller deviations (dark below 1 % of the beam, response below 10 %) are corrected by the division.
     hot = outliers(dark, 1e-3 * float(response))
@@ -63,7 +61,7 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     """
     n = len(light)
     middle = np.median(light, axis=0)
-    spread = np.median(np.abs(light - middle), axis=0) * _MAD
+    spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
     dark &= np.partition(light, n - 2, axis=0)[n - 2] < _DIM  # one view may have a zinger
     block = np.ones((3, 3))
@@ -94,7 +92,7 @@ def zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray
     step = max(1, int(np.sqrt(view.size / 4096)))
     r, c = (a.ravel() for a in np.meshgrid(*(np.arange(0, n, step) for n in view.shape), indexing="ij"))
     spread = root[r, c] - _around(root, r, c)[0]
-    limit = threshold * max(_MAD * float(np.median(np.abs(spread))), 0.005)
+    limit = threshold * max(median_deviation(spread), 0.005)
     before = np.sqrt(np.maximum(np.maximum.reduce(others), 0)) if others else np.zeros_like(root)
     r, c = np.nonzero(root > before + limit)
     middle, brightest = _around(root, r, c)

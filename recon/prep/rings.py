@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 from recon.base.choices import Rings
-from recon.base.noise import median_deviation, mirrored, without_layers
+from recon.base.noise import mirrored, without_layers
 from recon.base.units import warn_of_other_quantity
 
-_ROBUST = 1.4826  # median deviation to standard deviation, for normal values
+_ROBUST = 1.4826  # as 1 / MEDIAN, rounded: volumes that were recorded have it in what `by_sorting` takes off
 _FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
 _FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
 _MOST = 0.1  # of the columns
@@ -88,7 +88,7 @@ def without_large_stripes(sinogram: F32) -> F32:
     drop = len(ranked) // 10
     off = (ranked - smooth)[drop : len(ranked) - drop]
     shift = off.mean(axis=0)
-    far = np.abs(shift) > _FAR * max(_noise(sinogram), _ROBUST * float(np.median(np.abs(shift))))
+    far = np.abs(shift) > _FAR * max(_noise(sinogram), median_deviation(shift))
     far &= off.std(axis=0) < _EVEN * np.abs(shift)
     if far.mean() > _MOST:
         return sinogram  # so many columns belong to the sample
@@ -358,8 +358,8 @@ def _around(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:
 
 
 def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
-    off = np.abs(values - np.median(values))
-    return np.asarray(off > limit * _ROBUST * max(float(np.median(off)), 1e-12))
+    off = values - np.median(values)
+    return np.asarray(np.abs(off) > limit * max(median_deviation(off), 1e-12))
 
 
 def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:

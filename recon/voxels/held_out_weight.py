@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32, F64, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista

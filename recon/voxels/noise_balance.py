@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation, noise_beside_structure, noise_level
+from recon.base.noise import noise_beside_structure, noise_level
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.sweeps import whitened
 from recon.voxels.tv import difference_weights

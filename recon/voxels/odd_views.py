@@ -10,10 +10,9 @@ from itertools import combinations
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.noise import median_deviation
 from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines

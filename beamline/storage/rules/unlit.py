@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.references import BRIGHT, NORMAL, UNLIT, ReferenceFrame
+from beamline.monitor.references import BRIGHT, UNLIT, ReferenceFrame
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, look_at, reference_frame, some_of
 from drivers.base.frame import FrameKind
-from recon.base.arrays import F32
+from recon.base.arrays import F32, median_deviation
 
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
 _SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
@@ -86,8 +86,7 @@ def brightness(view: F32, dark: F32, flat: F32) -> float:
         return 1.0
     share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
     change = np.diff(share, axis=1)
-    change = change[np.isfinite(change)]
-    noise = NORMAL * float(np.median(np.abs(change))) / 2**0.5 if change.size else 0.0
+    noise = median_deviation(change) / 2**0.5
     known = share[np.isfinite(share)]
     if not known.size:
         return 0.0

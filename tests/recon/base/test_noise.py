@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from recon.base.arrays import median_deviation
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation, noise_beside_structure, noise_level, ring_offsets, without_layers
+from recon.base.noise import noise_beside_structure, noise_level, ring_offsets, without_layers
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 
