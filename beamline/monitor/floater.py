@@ -91,16 +91,16 @@ class FloaterCheck:
         if not state.step < COARSEST:
             return Look(state)
         half = grid.shape[1] / 2
-        octaves, found = [], list[Track]()
+        octaves, tracks = [], list[Track]()
         for before in state.octaves:
             octave = before
             if octave.views == 1 or half * state.step * octave.views <= FASTEST_RIM:
                 octave = with_view(before, view.index, state.time, view.depth, view.weight)
                 if octave.n > before.n:
-                    found += tracks_of(octave, _sample(grid, context, state.step), self.warn)
+                    tracks += tracks_of(octave, _sample(grid, context, state.step), self.warn)
             octaves.append(octave)
         state = replace(state, octaves=tuple(octaves))
-        sure = [track for track in found if _is_crumb(track)]
+        sure = [track for track in tracks if _is_crumb(track)]
         return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else Look(state)
 
     def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> Look[FloaterState]:

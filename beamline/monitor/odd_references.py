@@ -51,16 +51,16 @@ def without_odd(
     """
     limits = limits or ReferenceLimits()
     darks, flats = ([list(g) for g in groups if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
-    odd: list[JudgedGroup] = []
-    darks = _split(darks, _unusable(darks, None, limits), odd)
-    darks = _split(darks, _lit_darks(darks, flats), odd)
-    flats = _split(flats, _unusable(flats, darks, limits), odd)
-    flats = _split(flats, _changed(flats, darks, limits), odd)
+    judged: list[JudgedGroup] = []
+    darks = _split(darks, _unusable(darks, None, limits), judged)
+    darks = _split(darks, _lit_darks(darks, flats), judged)
+    flats = _split(flats, _unusable(flats, darks, limits), judged)
+    flats = _split(flats, _changed(flats, darks, limits), judged)
     views = lit_views(views, darks)
     if views:
-        flats = _split(flats, _with_sample(flats, darks, views, single=True), odd)
-        flats = _split(flats, _with_sample(flats, darks, views, single=False), odd)
-    return [*darks, *flats], odd
+        flats = _split(flats, _with_sample(flats, darks, views, single=True), judged)
+        flats = _split(flats, _with_sample(flats, darks, views, single=False), judged)
+    return [*darks, *flats], judged
 
 
 def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
@@ -87,12 +87,12 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     same = spreads[nearest] < SAME * noise
     if not (same or brighter > limit > 0):
         return None
-    said = (
+    sentence = (
         f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
         f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: "
         "the sample was in the beam."
     )
-    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, sentence)
 
 
 def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
@@ -111,24 +111,26 @@ class _Odd:
     kind: FaultKind
     score: float
     limit: float
-    said: str
+    sentence: str
 
 
-def _split(groups: list[list[ReferenceFrame]], found: list[_Odd], odd: list[JudgedGroup]) -> list[list[ReferenceFrame]]:
-    """The groups without the odd frames, which are added to the others; all of them, where none would be left."""
-    rows = {each.frame.row for each in found}
-    left = [[frame for frame in group if frame.row not in rows] for group in groups]
-    if not found or not any(left):
+def _split(
+    groups: list[list[ReferenceFrame]], odd: list[_Odd], judged: list[JudgedGroup]
+) -> list[list[ReferenceFrame]]:
+    """The groups without the odd frames, which are added to those judged; all of them, where none would be left."""
+    rows = {each.frame.row for each in odd}
+    good = [[frame for frame in group if frame.row not in rows] for group in groups]
+    if not odd or not any(good):
         return groups
     for group in groups:
         for kind in FaultKind:
-            own = [each for each in found if each.kind is kind and each.frame in group]
+            own = [each for each in odd if each.kind is kind and each.frame in group]
             if own:
                 scores = sorted(each.score for each in own)
                 figures = f"{scores[0]:.3g}" if scores[0] == scores[-1] else f"{scores[0]:.3g} to {scores[-1]:.3g}"
-                fault = ReferenceFault(kind, scores[-1], own[0].limit, own[0].said.format(figures=figures))
-                odd.append(JudgedGroup(group[0].kind, tuple(each.frame.row for each in own), (fault,)))
-    return [group for group in left if group]
+                fault = ReferenceFault(kind, scores[-1], own[0].limit, own[0].sentence.format(figures=figures))
+                judged.append(JudgedGroup(group[0].kind, tuple(each.frame.row for each in own), (fault,)))
+    return [group for group in good if group]
 
 
 def _unusable(
@@ -138,23 +140,23 @@ def _unusable(
     frames = [frame for group in groups for frame in group]
     if not frames:
         return []
-    found: list[_Odd] = []
+    odd: list[_Odd] = []
     zero = [frame for frame in frames if not np.any(frame.blocks)] if darks is None else []
     if 2 * sum(_varies(frame) for frame in frames) > len(frames):
-        said = "every pixel is 0: never written, or no frame of the camera."
-        found += [_Odd(frame, FaultKind.UNWRITTEN, 0.0, 0.0, said) for frame in zero]
+        sentence = "every pixel is 0: never written, or no frame of the camera."
+        odd += [_Odd(frame, FaultKind.UNWRITTEN, 0.0, 0.0, sentence) for frame in zero]
     for group in groups:
         least = min(frame.invalid for frame in group)
         hot = 0.0 if not darks else float(np.median([dark.saturated for each in darks for dark in each]))
         some = min(frame.saturated for frame in group) - hot <= limits.saturated  # else `judge` has the fault of all
         for frame in group:
             if frame.invalid > least + INVALID:
-                said = f"a share of {{figures}} of the pixels is not finite (limit {least + INVALID:.3g})."
-                found.append(_Odd(frame, FaultKind.NOT_FINITE, frame.invalid, least + INVALID, said))
+                sentence = f"a share of {{figures}} of the pixels is not finite (limit {least + INVALID:.3g})."
+                odd.append(_Odd(frame, FaultKind.NOT_FINITE, frame.invalid, least + INVALID, sentence))
             elif darks is not None and some and frame.saturated - hot > limits.saturated:
-                said = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
-                found.append(_Odd(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, said))
-    first_of_row = {each.frame.row: each for each in reversed(found)}
+                sentence = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
+                odd.append(_Odd(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, sentence))
+    first_of_row = {each.frame.row: each for each in reversed(odd)}
     return list(reversed(first_of_row.values()))
 
 
@@ -165,7 +167,7 @@ def _varies(frame: ReferenceFrame) -> bool:
 
 def _lit_darks(darks: list[list[ReferenceFrame]], flats: list[list[ReferenceFrame]]) -> list[_Odd]:
     """Darks above the darkest of their exposure: light only adds to counts."""
-    found = []
+    odd = []
     exposures = {_exposure(frame) for group in darks for frame in group}
     for exposure in exposures:
         same = [frame for group in darks for frame in group if _exposure(frame) == exposure]
@@ -177,19 +179,19 @@ def _lit_darks(darks: list[list[ReferenceFrame]], flats: list[list[ReferenceFram
         for frame in same:
             above = _level(frame) - lowest
             if above > limit:
-                said = (
+                sentence = (
                     f"there is light in them, or their offset moved: {{figures}} counts above the darkest dark, frame "
                     f"{base.row} with {lowest:.6g} (limit {limit:.3g}, by the {light:.6g} of light in the flats)."
                 )
-                found.append(_Odd(frame, FaultKind.LIGHT_IN_DARKS, above, limit, said))
-    return found
+                odd.append(_Odd(frame, FaultKind.LIGHT_IN_DARKS, above, limit, sentence))
+    return odd
 
 
 def _changed(
     flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], limits: ReferenceLimits
 ) -> list[_Odd]:
     """Flats with other light than most of their group; where half of the group differs, it has no right light."""
-    found = []
+    odd = []
     offset = _offset(darks)
     of_all = [[(frame.blocks - offset) / _seconds(frame) for frame in group] for group in flats]
     bright = [max(float(np.nanpercentile(each, BRIGHT)) for each in light) for light in of_all]
@@ -209,20 +211,22 @@ def _changed(
         flickers, changed = [], []
         for frame, dark, level, off, other in zip(group, unlit, levels, far, place, strict=True):
             if dark:
-                said = f"{{figures}} of the light of the group's brightest (limit {UNLIT:g}): no beam in them."
-                changed.append(_Odd(frame, FaultKind.NO_BEAM, max(float(level), 0.0), UNLIT, said))
+                sentence = f"{{figures}} of the light of the group's brightest (limit {UNLIT:g}): no beam in them."
+                changed.append(_Odd(frame, FaultKind.NO_BEAM, max(float(level), 0.0), UNLIT, sentence))
             elif uneven and off:
-                said = f"{{figures}} times the light of the usual flat of their group (limit 1 +- {limits.uneven:g})."
-                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(level), 1 + limits.uneven, said))
+                sentence = (
+                    f"{{figures}} times the light of the usual flat of their group (limit 1 +- {limits.uneven:g})."
+                )
+                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(level), 1 + limits.uneven, sentence))
             elif other > (limit := max(limits.uneven, CHANGE_SIGMAS * noise)):
-                said = (
+                sentence = (
                     "in places their light differs from the usual flat of their group by a share of {figures} (limit "
                     f"{limit:.3g}): something was in the beam. Is the sample out?"
                 )
-                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(other), limit, said))
+                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(other), limit, sentence))
         kept = len(group) - len(changed)
-        found += changed + (flickers if 2 * len(flickers) < kept else [])
-    return found
+        odd += changed + (flickers if 2 * len(flickers) < kept else [])
+    return odd
 
 
 def _with_sample(
@@ -238,7 +242,7 @@ def _with_sample(
     light = [[_cells(flat, base) for flat in group] for group in flats]
     means = [np.mean(group, axis=0) for group in light]
     bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
-    found = []
+    odd = []
     for at, group in enumerate(flats):
         if not bright[at] > UNLIT * max(bright):
             continue  # without light, which is another fault
@@ -260,14 +264,14 @@ def _with_sample(
             like = [_beyond_noise(_log(image, view, lit)) for view in seen]
             nearest = int(np.argmin(like))
             if like[nearest] < LIKER * off:
-                said = (
+                sentence = (
                     f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
                     f"line integral, and by {like[nearest]:.2g} only from the view in frame {views[nearest].row}: the "
                     "sample was in the beam."
                 )
                 frames = [group[i]] if single else group
-                found += [_Odd(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, said) for frame in frames]
-    return found
+                odd += [_Odd(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, sentence) for frame in frames]
+    return odd
 
 
 def _base(darks: list[list[ReferenceFrame]] | Sequence[Group]) -> Places | float:

@@ -215,8 +215,8 @@ class Exposures:
             begin = flown.start + float(block.angles[i] - block.angles[flown.first])
             if not self.go(begin):
                 return
-            left = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-            i += yield from self._pass(block, taken, left, i, (begin, flown.end))
+            rest = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
+            i += yield from self._pass(block, taken, rest, i, (begin, flown.end))
 
     def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
         """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a

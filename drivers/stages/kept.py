@@ -35,21 +35,21 @@ class FoundSettings:
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}
-        self.said = ""
+        self.notice = ""
         """What an earlier program left, in words; "" if it restored all."""
         self._store: SettingsStore | None = None
 
     def keep_in(self, store: SettingsStore) -> None:
         """See `RestoresSettings.keep_found_settings`."""
         earlier = {name: value for name, value in store.load().items() if name in self.values}
-        left = {name: self.values[name] for name, value in earlier.items() if self.values[name] != value}
+        changed = {name: self.values[name] for name, value in earlier.items() if self.values[name] != value}
         self.values |= earlier
         store.save(self.values)
         self._store = store
-        if left:
-            said = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in left.items())
-            self.said = (
-                f"a program that was killed, or lost this stage, left {said}; "
+        if changed:
+            values = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in changed.items())
+            self.notice = (
+                f"a program that was killed, or lost this stage, left {values}; "
                 "what stood there before is restored at the end"
             )
 

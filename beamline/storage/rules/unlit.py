@@ -52,12 +52,12 @@ class ViewLight:
             data: [view, row, col], as read.
             dark, flat: [row, col], of the same pixels; None: line integrals.
         """
-        least = np.array([view.min() == view.max() for view in data], np.bool_)
+        uniform = np.array([view.min() == view.max() for view in data], np.bool_)
         if dark is None or flat is None:
-            return least
+            return uniform
         small = [_binned(image) for image in (dark, flat)]
         bright = np.array([brightness(_binned(view), *small) for view in data])
-        return least | (bright < _SUSPECT * max(self.usual, 0.0))
+        return uniform | (bright < _SUSPECT * max(self.usual, 0.0))
 
     def unlit(self, frame: int) -> bool:
         """A whole view has no light, or is of one value where the flats are not."""
@@ -74,7 +74,7 @@ class ViewLight:
         same = bool(image.min() == image.max())
         if self.dark is None or self.flat is None:
             return same
-        bright = brightness(_of(look_at(image, frame)), self.dark, self.flat)
+        bright = brightness(_cells_of(look_at(image, frame)), self.dark, self.flat)
         return bright < LEAST * self.usual or (same and bool(np.ptp(self.flat) > 0))
 
 
@@ -104,7 +104,7 @@ def _binned(image: NDArray[np.generic]) -> F32:
 
 
 def _cells(source: ScanSource, row: int) -> F32:
-    return _of(reference_frame(source, row))
+    return _cells_of(reference_frame(source, row))
 
 
 def _mean_cells(source: ScanSource, groups: tuple[Frames, ...]) -> F32:
@@ -114,6 +114,6 @@ def _mean_cells(source: ScanSource, groups: tuple[Frames, ...]) -> F32:
     return np.asarray(np.mean(known, axis=0), np.float32)
 
 
-def _of(frame: ReferenceFrame) -> F32:
+def _cells_of(frame: ReferenceFrame) -> F32:
     assert frame.cells is not None
     return frame.cells

@@ -187,7 +187,7 @@ class EpicsStage(LineStage):
             "model": self._model,
             "port": self._url,
             "trigger_output": "none",
-            **found_at_opening(self._found.said),
+            **found_at_opening(self._found.notice),
             **self._travel.described(),
         }
 

@@ -142,7 +142,7 @@ class PiGcsStage(LineStage):
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **({"serial": self._serial} if self._serial else {}),
-            **found_at_opening(meaning(self._axis.error_at_opening), self._axis.found.said),
+            **found_at_opening(meaning(self._axis.error_at_opening), self._axis.found.notice),
             **self._travel.described(),
         }
 

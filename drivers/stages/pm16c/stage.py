@@ -122,7 +122,7 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
-            **found_at_opening(self._channel.error_at_opening, self._channel.found.said),
+            **found_at_opening(self._channel.error_at_opening, self._channel.found.notice),
             **self._travel.described(),
         }
 

@@ -255,7 +255,7 @@ class ZaberStage(LineStage):
             "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            **found_at_opening("" if flags is None else flags.text, self._axis.found.said),
+            **found_at_opening("" if flags is None else flags.text, self._axis.found.notice),
             **self._travel.described(),
         }
 
