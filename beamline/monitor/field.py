@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
@@ -90,16 +91,23 @@ class FieldOfViewCheck:
 
     def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid) -> Flag:
         left, right = edges
-        sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
+        cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
         advice = (
-            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there). "
-            f"The total absorption says nothing, floaters must be faster to be seen, and reconstructions are brighter "
-            f"at the rim."
+            f"{beyond_the_field(cut)} The total absorption says nothing, floaters must be faster to be seen, and "
+            "reconstructions are brighter at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)
         region = (0, rows, first * grid.cell, (first + 2) * grid.cell)
         return Flag(self.name, Level.INFO, row, max(left, right), self.edge, advice, region)
+
+
+def beyond_the_field(cut: Mapping[str, float]) -> str:
+    """A sentence for edges ("left", "right") that the sample goes on beyond, by the line integrals there."""
+    return (
+        f"The sample goes on beyond the {' and '.join(cut)} edge of the field (line integral {max(cut.values()):.2f} "
+        "there)."
+    )
 
 
 def _noise(light: NDArray[np.float32]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamline.projections.steps.air import EDGE
+from beamline.monitor.field import FieldOfViewCheck, beyond_the_field
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.voxels.view_weights import covers_the_circle
@@ -17,8 +17,10 @@ def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
     """Line integral at each edge ("left", "right") beyond which the sample goes on; empty where it is in the field.
 
     The median over views and rows is asked, in each quarter of the scan: corners at some angles do not count. It
-    must be more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn
-    about an axis off the middle is cut near the axis on purpose; the other half turn sees what is there.
+    must be more than the default limit of the monitor's check `field`, which asks the same of each view while it comes,
+    and than a tenth of what is in the middle. A full turn about an axis off the middle is cut near the axis on purpose;
+    the other half turn sees what is there. [`recon.prep.air.edge_depth` asks before, of views whose beam may have
+    drifted, whether columns that look like air are a sample]
 
     Args:
         data: line integrals [view, row, col].
@@ -39,14 +41,13 @@ def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
         side: min(float(np.median(part)) for part in np.array_split(values, min(_PARTS, len(values))))
         for side, values in edges.items()
     }
-    return {side: level for side, level in levels.items() if level > max(EDGE, _SHARE * depth)}
+    return {side: level for side, level in levels.items() if level > max(FieldOfViewCheck.edge, _SHARE * depth)}
 
 
 def cut_said(sides: dict[str, float]) -> str:
     """A warning for `cut_sides`."""
     return (
-        f"The sample goes on beyond the {' and '.join(sides)} edge of the field (line integral "
-        f"{max(sides.values()):.2f} there). What lies outside is not seen by all views: values inside are relative, "
-        "not absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
+        f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "
+        "absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
         "columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
     )

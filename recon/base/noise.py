@@ -20,7 +20,7 @@ _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
 _CLEARLY = 1.15  # structure is taken for noise, where the noise beside it is less by so much
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
-_LEAST_FIELD = 0.4  # of the columns, on the shorter side of the axis
+_SHORTER_SIDE = 0.4  # of the columns, at least, from the axis to the nearer edge: fewer resolve no bow-tie
 _EVEN, _MARGIN = 0.02, 1.1  # of a step between views; of the bound
 _BLOCKS, _BLOCK = 8, 5
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
@@ -82,7 +82,7 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     axis = geometry.axis_col + geometry.shifts[:, 0]
     half = int(min(axis.min(), cols - 1 - axis.max()))
     rows = np.flatnonzero(np.isfinite(lines).all(axis=(0, 1)))
-    if order is None or not geometry.is_straight or geometry.skew or half < _LEAST_FIELD * cols or not rows.size:
+    if order is None or not geometry.is_straight or geometry.skew or half < _SHORTER_SIDE * cols or not rows.size:
         return math.inf
     rows = rows[:: -(-rows.size // _BOW_TIE_ROWS)]
     middle = round(float(axis.mean()))

@@ -20,10 +20,6 @@ Columns = Literal["none", "auto"] | tuple[int, int]
 Surface = Literal["auto", "none"] | int
 """The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
 
-EDGE = 0.1
-"""Line integral at the edges up to which a sample is inside the field, as of the monitor's check `field`: more than
-phase fringes and scattered light leave there."""
-
 _MODELS: dict[str, tuple[Columns, Surface]] = {
     "auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none"),
 }  # fmt: skip
@@ -76,8 +72,10 @@ class Air:
 
     @property
     def sample_from(self) -> float:
-        """Line integral at the edges from which they are sample; columns that were asked for are air."""
-        return EDGE if self.model == "auto" else math.inf
+        """Line integral at the edges from which they are sample, as for the monitor; columns asked for are air."""
+        from beamline.monitor.field import FieldOfViewCheck
+
+        return FieldOfViewCheck.edge if self.model == "auto" else math.inf
 
     @property
     def surface(self) -> Surface:
