@@ -309,9 +309,9 @@ class _Run:
         error = self._worse(error, disk)
         faults = self.references.faults(recorder.references)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
-        missing = acquisition.missing
+        missing, why = acquisition.missing, "" if error is None else user_message(error)
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
-        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
+        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings, why))
         error = self._worse(error, unfinished)
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
