@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -261,7 +262,7 @@ class _Run:
     def _set_volume_aside(self) -> None:
         """Rename volume and report of the views before, in a run that goes on: that of all parts gets their names."""
         for path in (self.volume, self.volume.with_name(REPORT)):
-            if self.series is None or not path.exists():
+            if self.series is None or not os.path.lexists(path):
                 continue
             aside = path.with_stem(f"{path.stem}.before-{self.folder.name}")
             try:
