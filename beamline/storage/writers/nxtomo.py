@@ -7,6 +7,8 @@ the death of this process. Every second they are brought to the disk (fsync), wh
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,6 +25,7 @@ from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of, place_of
+from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import STATUSES, Ending, state_ending, state_words
@@ -42,6 +45,10 @@ LAST = (
 )  # fmt: skip
 """Datasets that are written when a scan ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
+
+
+class _TouchedError(OSError):
+    """Another program has cut or deleted the file while it was written."""
 
 
 class NXtomoWriter:
@@ -114,7 +121,8 @@ class NXtomoWriter:
                 ) from error
             raise
         self._table = Rows(self._file)
-        self._to_disk = ToDisk(self._file.id.get_vfd_handle())
+        self._handle: int = self._file.id.get_vfd_handle()
+        self._to_disk, self._before = ToDisk(self._handle), os.fstat(self._handle)
         self._progress = self._file[layout.COMMITTED]
         # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
@@ -131,6 +139,7 @@ class NXtomoWriter:
             mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces,
         )  # fmt: skip
         try:
+            self._require_untouched()
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
                 if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
@@ -165,11 +174,12 @@ class NXtomoWriter:
         """Commit the rows appended so far, whatever `flush_every` says; nothing after a failed write."""
         if self._broken:
             return
+        self._require_untouched()
         self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()
-        self._committed = self._rows
+        self._committed, self._before = self._rows, os.fstat(self._handle)
         self._to_disk(self._committed)
 
     def close(
@@ -239,6 +249,8 @@ class NXtomoWriter:
         self._to_disk.finish(self._committed)
         try:
             self._file.close()
+            if (head := superblock(self.path)) is None or not head.intact or head.missing:
+                raise _TouchedError(errno.EIO, "it is not as it was written")
         except FAILURES:
             self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
             raise
@@ -256,6 +268,14 @@ class NXtomoWriter:
         finally:
             hdf5.never_close(self._file)
 
+    def _require_untouched(self) -> None:
+        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        now = os.fstat(self._handle)
+        if now.st_nlink < self._before.st_nlink:
+            raise _TouchedError(errno.ENOENT, "it was deleted")
+        if now.st_size < self._before.st_size:
+            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
+
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""
         if not self._open or self._broken:
@@ -270,6 +290,12 @@ class NXtomoWriter:
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
+        if isinstance(error, _TouchedError):
+            return DataError(
+                f"{self.path} was touched by another program while it was written: {error.strerror}. Of the "
+                f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
+                "the copy, and scan again."
+            )
         free = shutil.disk_usage(self.path.parent).free
         return DataError(
             f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "
