@@ -92,8 +92,21 @@ def decoded(content: bytes) -> str:
     return content.decode("utf-16" if utf16 else "utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
+def broken_link(path: Path) -> str:
+    """A sentence if `path`, or a folder on the way to it, is a link to what is not there; "" if not."""
+    for place in (path, *path.parents):
+        if place.is_symlink() and not place.exists():
+            return f"{place} is a link to {place.readlink()}, which is not there: is its disk mounted?"
+    return ""
+
+
 def refuse_existing(path: Path) -> None:
-    """Raise DataError if `path` exists (results are never overwritten) or its folder does not."""
+    """Raise DataError unless a new file or folder may get the name `path`.
+
+    Results never take the place of anything, also not of a link to what is not there, and their folder must exist.
+    """
+    if link := broken_link(path):
+        raise DataError(f"{link} Links are never replaced. Mount it, or name another output. Nothing was written.")
     if path.exists():
         raise DataError(f"{path} exists and results are never overwritten. Name another output, or move it away.")
     if not path.parent.is_dir():
@@ -111,6 +124,16 @@ def named_on_failure(path: Path) -> Iterator[None]:
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
 
 
+def replaceable(path: Path) -> Path:
+    """The file itself that may be replaced or made under the name `path`: the target, where that is a link.
+
+    DataError where the target is not there.
+    """
+    if link := broken_link(path):
+        raise DataError(f"{link} Links are never replaced. Mount it, or remove the link. Nothing was written.")
+    return path.resolve() if path.is_symlink() else path
+
+
 def to_disk(handle: int) -> None:
     """Wait until all data written to an open file are on the disk. OSError if the disk did not take them."""
     try:
@@ -118,6 +141,16 @@ def to_disk(handle: int) -> None:
     except OSError as error:
         if error.errno not in _NO_SUCH_CALL:
             raise
+
+
+def folder_to_disk(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk; Windows has no such call. OSError if it did not take them."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            to_disk(handle)
+        finally:
+            os.close(handle)
 
 
 def bring_to_disk(path: Path) -> None:
@@ -135,12 +168,15 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
     Args:
         path: the file to write. Without `replace` it must not exist.
-        replace: an existing file is replaced in one step; a reader sees either the old or the new file.
+        replace: an existing file is replaced in one step; a reader sees either the old or the new file. A link stays,
+            and its target is replaced.
 
     Raises:
         DataError: `path` exists, the disk refuses, or the system does not allow to replace it.
     """
-    if not replace:
+    if replace:
+        path = replaceable(path)
+    else:
         refuse_existing(path)
     _remove_left(path)
     partial = path.with_name(f".{path.name}.{_here()}-{os.getpid()}-{uuid.uuid4().hex[:4]}.partial")
@@ -153,6 +189,8 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             partial.replace(path)
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
+        with suppress(OSError):  # the file is there in any case
+            folder_to_disk(path.parent)
     except OSError as error:
         left = "what was there is untouched" if replace else "nothing is left of it"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error

@@ -16,6 +16,7 @@ from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.ingest import PER_FLUSH, complete
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import Ending
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
@@ -152,7 +153,8 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
             count(view + 1, angles.size)
             if view % PER_FLUSH == PER_FLUSH - 1:
                 rows.flush()
-        complete(file, rows, angles.size)
+        rows.flush()
+        complete(file, Ending())
 
 
 def write_ply(path: Path, model: Model) -> None:

@@ -21,6 +21,7 @@ from beamline.report.contact_sheet import FlaggedFrame
 from beamline.report.record import history_arrays, residual_curve
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.rules.validate import scan_ended
 from drivers.base.frame import FrameKind
 from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
@@ -43,6 +44,7 @@ class ScanFacts:
         references: mean darks and flats [row, col], binned, by title.
         shape: of a frame.
         columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
+        ended: how the scan ended where it did not take all its frames, and why; empty: it did, or runs.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class ScanFacts:
     references: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     shape: tuple[int, int] = (1, 1)
     columns: str = ""
+    ended: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +188,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     flagged = [] if flags is None else worst_frames(source, flags)
     frames = f"{n}/{n + missing}"
     images = reference_images(source)
+    ended = " ".join(finding.message for finding in scan_ended(source)) if source.finished else ""
     return ScanFacts(
-        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, columns
+        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, columns, ended
     )
 
 

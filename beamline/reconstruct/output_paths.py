@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -47,7 +48,7 @@ class OutputPaths:
 
     def refuse_partial(self) -> None:
         """Raise DataError if there are slabs of an earlier call."""
-        if self.partial.exists():
+        if os.path.lexists(self.partial):
             raise DataError(
                 f"{self.partial} exists: it keeps the slabs of a call that was stopped. Go on from it with --resume "
                 f"{self.partial}, or move it away. Nothing was touched."

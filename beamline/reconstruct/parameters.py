@@ -34,6 +34,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
         **({} if context.region is None else {"roi": str(context.region.region)}),
         **({"columns": context.facts.columns} if context.facts.columns else {}),
+        **({"scan_ended": context.facts.ended} if context.facts.ended else {}),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,

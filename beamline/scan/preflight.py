@@ -16,6 +16,7 @@ from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, at_energies, camera_settings, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
+from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.instrument import connect
@@ -190,6 +191,8 @@ def disk_of(folder: Path) -> Path:
         ConfigError: a file stands in the way, or there is no such disk.
     """
     folder = folder.absolute()
+    if link := broken_link(folder):
+        raise ConfigError(f"runs cannot go to {folder}: {link} Choose another folder; nothing was started.")
     there = next((place for place in (folder, *folder.parents) if place.exists()), None)
     if there is None or not there.is_dir():
         problem = "no such disk" if there is None else f"a file at {there}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -261,7 +262,7 @@ class _Run:
     def _set_volume_aside(self) -> None:
         """Rename volume and report of the views before, in a run that goes on: that of all parts gets their names."""
         for path in (self.volume, self.volume.with_name(REPORT)):
-            if self.series is None or not path.exists():
+            if self.series is None or not os.path.lexists(path):
                 continue
             aside = path.with_stem(f"{path.stem}.before-{self.folder.name}")
             try:
@@ -309,9 +310,9 @@ class _Run:
         error = self._worse(error, disk)
         faults = self.references.faults(recorder.references)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
-        missing = acquisition.missing
+        missing, why = acquisition.missing, "" if error is None else user_message(error)
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
-        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings))
+        unfinished = disk if recorder.hangs else _failure_of(lambda: writer.close(status, missing, beam.readings, why))
         error = self._worse(error, unfinished)
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed

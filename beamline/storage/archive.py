@@ -109,7 +109,9 @@ def archive(
             )
         parts = (scan.parent / name for dataset in datasets for name in _drawn_from(dataset))
         sources = tuple(dict.fromkeys((scan, *parts)))
-        raw_bytes = sum(path.stat().st_size for path in sources)
+        raw_bytes, compared = sum(path.stat().st_size for path in sources), partial.stat()
+    if out.is_symlink() or not os.path.samestat(out.stat(), compared):
+        raise DataError(f"{out} is not the file that was written and compared. Keep {scan}, which is untouched.")
     return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)), altered)
 
 

@@ -7,8 +7,10 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,9 @@ from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said, stated_used
+from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import DIED, RUNNING, Ending, state_ending
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
@@ -68,6 +72,7 @@ def ingest(
     """
     out = Path(out)
     with whole_file(out) as partial, open_scan(scan) as source:
+        ending = _ending_of(source)
         views = source.image_key == FrameKind.PROJECTION
         if not np.isfinite(source.angles[views]).all():
             raise DataError(
@@ -87,6 +92,7 @@ def ingest(
                 "one size. Reconstruct it as it is. Nothing was written."
             )
         distance = source.attributes.get("distance_mm")
+        other_angles = isinstance(scan, SourceOptions) and not scan.angles is scan.angles_path is None
         if source.cone is not None:
             distance = source.cone[1] - source.cone[0]
         info = layout.ScanInfo(
@@ -97,9 +103,11 @@ def ingest(
             axis_col=source.axis_col,
             distance_mm=distance if isinstance(distance, int | float) else None,
             source_distance_mm=None if source.cone is None else source.cone[0],
+            plan=json.dumps({} if other_angles else dict(source.plan)),
         )
         with hdf5.created(partial, layout.LIBVER) as file:
             invalid = _copy(source, file, out, info, no_data, progress)
+            complete(file, ending)
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
@@ -141,18 +149,29 @@ def _copy(
             progress(i + 1, n)
         if (i + 1) % PER_FLUSH == 0:
             rows.flush()
-    complete(file, rows, n)
+    rows.flush()
     return invalid
 
 
-def complete(file: hdf5.NewFile, rows: Rows, n: int) -> None:
-    """State that a file that `layout.create` made holds all its n frames, with the /exchange view of them."""
-    rows.flush()
-    file[layout.COMMITTED][()] = n
-    file[layout.STATUS][()] = b"complete"
+def complete(file: hdf5.NewFile, ending: Ending) -> None:
+    """State that a file that `layout.create` made holds all frames of its scan, and how that ended; add /exchange."""
+    file[layout.COMMITTED][()] = len(file[layout.DATA])
+    state_ending(file, ending)
     file[layout.FINISHED][()] = 1
     layout.state_field_of_view(file)
     add_exchange_view(file)
+
+
+def _ending_of(source: ScanSource) -> Ending:
+    """How the scan ended. DataError while it runs: what it lacks is not known yet."""
+    if source.ending.status != RUNNING:
+        return source.ending
+    if held(source.path) or time.time() - source.path.stat().st_mtime < QUIET:
+        raise DataError(
+            f"{source.path} is being written, or its program died less than {QUIET:.0f} s ago. Let the scan end. "
+            "Nothing was written."
+        )
+    return replace(source.ending, status="failed", reason=DIED)
 
 
 def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import DataError
-from beamline.core.files import to_disk, whole_file
+from beamline.core.files import folder_to_disk, to_disk, whole_file
 from beamline.core.text import size
 
 _FORMAT = "splatline journal 1"
@@ -70,7 +70,7 @@ class FileChanges:
                 file.write(_journal(self))
                 file.flush()
                 to_disk(file.fileno())
-            _folder_to_disk(journal.parent)
+            folder_to_disk(journal.parent)
         except (OSError, DataError) as error:
             with suppress(OSError):
                 journal.unlink(missing_ok=True)
@@ -184,16 +184,6 @@ def _put(file: Any, at: int, data: bytes) -> None:
     file.seek(at)
     while data:
         data = data[file.write(data) :]
-
-
-def _folder_to_disk(folder: Path) -> None:
-    """The names in it; Windows has no such call."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            to_disk(handle)
-        finally:
-            os.close(handle)
 
 
 def _why(error: BaseException) -> str:

@@ -13,6 +13,7 @@ import json
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from beamline.core.files import EVENTS, parts_of, run_of, whole_file
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import ending_in, state_ending
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.rows import altered_rows, record_checksums, require_earlier
 from drivers.base.frame import FrameKind
@@ -61,6 +63,22 @@ def views_planned(file: h5py.File) -> int | None:
     return None if angles is None else len(angles)
 
 
+def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
+    """Triggers before the last view that gave no frame, by the frames themselves: for files whose writer died.
+
+    None of a later part of a run, which takes what the parts before lack, and of files without their plan.
+    """
+    n = int(file[layout.COMMITTED][()])
+    kinds, triggers = file[layout.KIND][:n], file[layout.TRIGGER][:n]
+    views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+    if not views.size or views_planned(file) is None or run_of(path.resolve().parent) != path.resolve().parent:
+        return ()
+    before = np.isin(kinds[: views[0]], (FrameKind.DARK, FrameKind.FLAT))
+    first = np.flatnonzero(before)[-1] + 1 if before.any() else 0
+    seen = triggers[first : views[-1] + 1]
+    return tuple((_planned_before_views(file) + np.setdiff1d(np.arange(seen.max()), seen)).tolist())
+
+
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
     """Kinds of references planned after the views that the files of a scan lack, wholly or in part.
 
@@ -69,6 +87,13 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
     """
     taken = _after_views(files)
     return frozenset(kind for kind, n in _planned_after_views(files[0]).items() if len(taken[kind]) < n)
+
+
+def _planned_before_views(file: h5py.File) -> int:
+    """Number of references planned before the views."""
+    plan = json.loads(file["/entry/record/plan"].asstr()[()])
+    fields = (plan.get(kind, {}) for kind in ("darks", "flats"))
+    return sum(int(field["count"]) for field in fields if field.get("at") in ("start", "both"))
 
 
 def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
@@ -227,13 +252,12 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         hdf5.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
     for path, item in _links(files[0]):
         joined[path] = joined[item]
-    for path in (layout.END_TIME, layout.STATUS):
-        del joined[path]
-        files[-1].copy(path, joined, path)
+    del joined[layout.END_TIME]
+    files[-1].copy(layout.END_TIME, joined, layout.END_TIME)
+    state_ending(joined, replace(ending_in(files[-1]), missing=_missing(files)))
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
     _name_parts(files, names, rows, joined)
     joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
-    _name_missing(files, joined)
     joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
     layout.state_field_of_view(joined)
     add_exchange_view(joined)
@@ -274,16 +298,12 @@ def _target(item: h5py.HLObject) -> str:
     return hdf5.attribute(item, "target")
 
 
-def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
+def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
     """Triggers that gave no frame, in a later part either."""
-    plan = json.loads(files[0]["/entry/record/plan"].asstr()[()])
-    before = sum(plan[kind]["count"] for kind in ("darks", "flats") if plan[kind]["at"] in ("start", "both"))
+    before = _planned_before_views(files[0])
     stored = {before + view for file in files for view in views_in(file)}
-    taken, first = _after_views(files), before + len(plan.get("angles_deg", ()))
+    taken, first = _after_views(files), before + (views_planned(files[0]) or 0)
     for kind, n in _planned_after_views(files[0]).items():
         stored |= {first + trigger for trigger in taken[kind]}
         first += n
-    missing = {int(trigger) for file in files for trigger in file[layout.MISSING][()]} - stored
-    del joined[layout.MISSING]
-    joined[layout.MISSING] = np.array(sorted(missing), np.int64)
-    hdf5.copy_attributes(files[0][layout.MISSING], joined[layout.MISSING])
+    return tuple(sorted({trigger for file in files for trigger in ending_in(file).missing} - stored))

@@ -24,11 +24,12 @@ from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
 from beamline.storage.journal import FileChanges
 from beamline.storage.overlay import Overlay, WholeBlocks
-from beamline.storage.parts import require_joined, views_in, views_planned
+from beamline.storage.parts import gaps_in, require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import DIED, RUNNING, Ending, ending_in, state_ending, state_words
 from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
 from beamline.storage.writers.rows import altered_rows
 
@@ -182,10 +183,12 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
             _read(file)
         with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
             committed, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
-            frames = _cut(file, committed, head.size)
+            frames = _cut(path, file, committed, head)
         overlay.seek(0)
         made = replace(head, head=overlay.read(SIZE))
-        if made.missing:  # all that is left lies before, or the next lines would not read it
+        if made.missing and (
+            head.missing or frames < committed
+        ):  # all that is left lies before, or the next lines would not read it
             overlay.put(0, made.closed(head.size).head)
             overlay.truncate(head.size)
         with h5py.File(overlay, "r") as file:
@@ -211,16 +214,24 @@ def _read(file: h5py.File) -> None:
             item[()]
 
 
-def _cut(file: h5py.File, committed: int, there: int) -> int:
+def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
     """End the file as a writer does, with the frames that are committed and on the disk; how many these are."""
     growing = (layout.DATA, layout.PREVIEW, *layout.GROWING)
-    frames = min(committed, *(_rows_within(file[name], there) for name in growing))
+    frames = min(committed, *(_rows_within(file[name], head.size) for name in growing))
     for name in growing:
         if len(file[name]) != frames:
             file[name].resize(frames, 0)
-    if frames < committed or hdf5.text(file[layout.STATUS][()]) == "running":
-        file[layout.STATUS][()] = b"failed"
     file[layout.COMMITTED][()], file[layout.FINISHED][()] = frames, 1
+    ending = ending_in(file)
+    if ending.status == RUNNING:
+        ending = Ending("failed", gaps_in(path, file), DIED)
+    if frames < committed:
+        lost = f"Frames {spans(range(frames, committed))} were written and are not on the disk."
+        ending = replace(ending, status="failed", reason=f"{ending.reason} {lost}".strip())
+    if head.missing or frames < committed:  # a list of triggers would take room beyond what is there
+        state_words(file, ending)
+    elif ending != ending_in(file):
+        state_ending(file, ending)
     times = file[layout.TIME][()]
     if layout.END_TIME in file and not file[layout.END_TIME][()] and np.isfinite(times).any():
         file[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()

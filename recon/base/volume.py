@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -181,7 +182,7 @@ class Volume:
         path, grid = Path(path), self.grid
         if path.suffix != ".npz":
             raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")
-        if path.exists():
+        if os.path.lexists(path):
             raise FileExistsError(f"{path} exists and is not overwritten; name another file")
         partial = path.with_name(f".{path.name}.partial.npz")
         places: dict[str, object] = {

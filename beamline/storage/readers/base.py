@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
+from beamline.storage.writers.ending import Ending
 from drivers.base.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
@@ -101,6 +102,11 @@ class ScanSource(ABC):
     def finished(self) -> bool:
         """No more frames will come. Ask before refresh(): refresh() then finds all frames."""
         return True
+
+    @property
+    def ending(self) -> Ending:
+        """How the scan ended, as far as the file tells; a copy states the same."""
+        return Ending()
 
     @property
     def attributes(self) -> Attributes:

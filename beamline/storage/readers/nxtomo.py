@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
-from beamline.storage.parts import require_joined
+from beamline.storage.parts import gaps_in, require_joined
 from beamline.storage.readers.base import (
     WHOLE,
     NotUsed,
@@ -35,6 +36,7 @@ from beamline.storage.readers.nexus_geometry import differing, read_energy, read
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_used
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import RUNNING, Ending, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
 
@@ -161,7 +163,7 @@ class NXtomoSource(ScanSource):
 
     @property
     def attributes(self) -> dict[str, str | float | int]:
-        """What else the file says: sample, title, times, status, missing triggers."""
+        """What else the file says: sample, title, times, status, missing triggers, why it ended early."""
         with hdf5.readable(self.path):
             return self._said()
 
@@ -185,11 +187,19 @@ class NXtomoSource(ScanSource):
         if self._places.data.is_virtual:
             said["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
         if self._ours:
-            for item in (self._file[layout.STATUS], self._file[layout.MISSING]):
-                hdf5.look_again(item)
-            said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
-            said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
+            ending = ending_in(self._file)
+            said |= {"status": ending.status, "missing_triggers": len(ending.missing)}
+            if ending.reason:
+                said["ended"] = ending.reason
         return said
+
+    @property
+    def ending(self) -> Ending:
+        if not self._ours:
+            return Ending()
+        with hdf5.readable(self.path):
+            ending = ending_in(self._file)
+            return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
     def _find_not_used(self) -> tuple[NotUsed, ...]:
         if self._geometry is None:

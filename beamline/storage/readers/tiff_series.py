@@ -26,6 +26,7 @@ from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.image_names import angles_of, kinds_of, without_angle
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image, refuse_volume
+from beamline.storage.writers.ending import Ending
 from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
@@ -75,10 +76,17 @@ class TiffSeriesSource(ScanSource):
         except BaseException:
             self.close()
             raise
-        gaps = _gaps(series if in_names is None else [without_angle(name) for name in series])
+        numbers = _numbers(series if in_names is None else [without_angle(name) for name in series])
+        left_out = [] if numbers is None else sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()})
+        gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
+        self._missing = tuple(before + number for number in left_out)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if in_names is not None and self.angle_text is None:
             self.facts |= {"angles_from": "the names of the files"}
+
+    @property
+    def ending(self) -> Ending:
+        return Ending(missing=self._missing)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)
@@ -207,14 +215,6 @@ def _numbers(names: list[str]) -> NDArray[np.int64] | None:
     if numbers.size < len(names) or np.ptp(numbers) > COUNTED * numbers.size:
         return None
     return numbers
-
-
-def _gaps(names: list[str]) -> str:
-    """Numbers that a series leaves out between its first and its last."""
-    numbers = _numbers(names)
-    if numbers is None:
-        return ""
-    return spans(sorted(set(range(numbers.min(), numbers.max())) - set(numbers.tolist())))
 
 
 FORMAT = ScanFormat(

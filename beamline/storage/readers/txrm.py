@@ -15,9 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.text import count
 from beamline.storage import hdf5
 from beamline.storage.readers.base import Opening, ScanFormat
 from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.writers.ending import Ending
 from drivers.base.frame import FrameKind
 
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
@@ -91,6 +93,12 @@ class TxrmSource(StacksSource):
     """A scan of a .txrm, whose views may be displaced."""
 
     _shifts: NDArray[np.float64] | None = None
+    _ending = Ending()
+
+    def set_ending(self, taken: int, planned: int) -> None:
+        """How many of the planned views were taken."""
+        if taken < planned:
+            self._ending = Ending("stopped", reason=f"{taken} of {count(planned, 'planned view')} were taken.")
 
     def set_shifts(self, shifts: NDArray[np.float64]) -> None:
         """Of the views, [view, 2]."""
@@ -101,6 +109,10 @@ class TxrmSource(StacksSource):
     @property
     def shifts(self) -> NDArray[np.float64] | None:
         return self._shifts
+
+    @property
+    def ending(self) -> Ending:
+        return self._ending
 
 
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
@@ -145,6 +157,7 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         ]
     source = TxrmSource(path, file, stacks, format="txrm", facts=_facts(file))
     source.set_shifts(_shifts(path, file, n))
+    source.set_ending(n, planned)
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:

@@ -100,11 +100,13 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 
 def scan_ended(source: ScanSource) -> Iterator[Finding]:
     """The writer closed the file, and the scan ended as it was planned; else what can be done."""
-    status, n = source.attributes.get("status"), count(source.image_key.size, "frame")
+    ending, n = source.ending, count(source.image_key.size, "frame")
     if not source.finished:
         said = f"The file was not closed: {n} can be trusted."
-    elif status in ("stopped", "failed"):
-        said = f"The scan ended as {status!r} after {n}."
+    elif ending.status in ("stopped", "failed"):
+        planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
+        of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
+        said = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         return
     yield Finding("warning", "unfinished", f"{said} {next_step(source.path)}".strip())

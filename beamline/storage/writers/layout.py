@@ -16,7 +16,7 @@
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
       record/parts              of joined.h5: name, frames and digest of each file that it draws from
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
-      progress                  frames_committed, finished, status, missing_triggers
+      progress                  frames_committed, finished, status, missing_triggers, reason
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
 image_key holds 0, 1, 2, 3; an alignment frame is 3 there, and -1 in frame_log/kind. image_key_control (a link to it),
@@ -69,6 +69,7 @@ RECORD_CHECKSUM = "/entry/frame_log/checksum"
 FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
+REASON = "/entry/progress/reason"
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
@@ -82,6 +83,7 @@ for cones."""
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
+REASON_BYTES = 600
 FULL = "Full"
 _TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 
@@ -192,6 +194,7 @@ def create(
     file[COMMITTED] = np.int64(0)
     file[FINISHED] = np.int8(0)
     _rewritable_text(file, STATUS, "running", 16)
+    _rewritable_text(file, REASON, "", REASON_BYTES)
     _growing(file, MISSING, (), np.dtype("<i8"))
     file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
 

@@ -7,6 +7,8 @@ the death of this process. Every second they are brought to the disk (fsync), wh
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,17 +17,18 @@ from typing import Self
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, user_message
 from beamline.core.text import size
 from beamline.monitor.check import Flag
 from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of, place_of
+from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
+from beamline.storage.writers.ending import STATUSES, Ending, state_ending, state_words
 from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.rows import Record, Rows
@@ -36,13 +39,16 @@ from drivers.base.protocols import BeamReading
 
 __all__ = ["NXtomoWriter", "ScanInfo"]
 
-STATUSES = ("complete", "stopped", "failed")
 LAST = (
-    layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.BEAM_TIME,
-    layout.BEAM_VALUE,
+    layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.REASON,
+    layout.BEAM_TIME, layout.BEAM_VALUE,
 )  # fmt: skip
 """Datasets that are written when a scan ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
+
+
+class _TouchedError(OSError):
+    """Another program has cut or deleted the file while it was written."""
 
 
 class NXtomoWriter:
@@ -115,7 +121,8 @@ class NXtomoWriter:
                 ) from error
             raise
         self._table = Rows(self._file)
-        self._to_disk = ToDisk(self._file.id.get_vfd_handle())
+        self._handle: int = self._file.id.get_vfd_handle()
+        self._to_disk, self._before = ToDisk(self._handle), os.fstat(self._handle)
         self._progress = self._file[layout.COMMITTED]
         # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
         self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
@@ -132,6 +139,7 @@ class NXtomoWriter:
             mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces,
         )  # fmt: skip
         try:
+            self._require_untouched()
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
                 if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
@@ -166,21 +174,27 @@ class NXtomoWriter:
         """Commit the rows appended so far, whatever `flush_every` says; nothing after a failed write."""
         if self._broken:
             return
+        self._require_untouched()
         self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()
-        self._committed = self._rows
+        self._committed, self._before = self._rows, os.fstat(self._handle)
         self._to_disk(self._committed)
 
-    def close(self, status: str = "complete", missing: Sequence[int] = (), beam: Sequence[BeamReading] = ()) -> None:
-        """Finish: missing triggers, end time and status, then `finished`, then the /exchange view. Twice is once.
+    def close(
+        self,
+        status: str = "complete",
+        missing: Sequence[int] = (),
+        beam: Sequence[BeamReading] = (),
+        reason: str = "",
+    ) -> None:
+        """Finish: how the scan ended and when, then `finished`, then the /exchange view. Twice is once.
 
         After a failed write the file only gets status "failed" and `finished`, and is not closed.
 
         Args:
-            status: "complete", "stopped" (by the operator) or "failed".
-            missing: triggers, counted over the whole scan from 0, that gave no frame.
+            status, missing, reason: see Ending.
             beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
 
         DataError where the disk does not take it; the frames committed stay readable.
@@ -192,15 +206,15 @@ class NXtomoWriter:
         self._open = False
         try:
             if self._broken:
-                self._let_go()
+                self._let_go(reason)
                 return
-            self._finish(status, np.asarray(missing, np.int64), beam)
+            self._finish(Ending(status, tuple(missing), reason), beam)
             self._put_exchange_view()
         except FAILURES as error:
             if not self._broken:
                 self._broken = True
                 with suppress(*FAILURES):
-                    self._let_go()
+                    self._let_go(reason or f"The file could not be finished ({hdf5.reason(error)}).")
             raise self._disk_error("be finished", error) from error
         finally:
             self._lock.release()
@@ -208,13 +222,12 @@ class NXtomoWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close("complete" if kind is None else "failed")
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
+        self.close("complete" if error is None else "failed", reason="" if error is None else user_message(error))
 
-    def _finish(self, status: str, missing: NDArray[np.int64], beam: Sequence[BeamReading]) -> None:
+    def _finish(self, ending: Ending, beam: Sequence[BeamReading]) -> None:
         self.flush()
         series = {
-            layout.MISSING: missing,
             layout.BEAM_TIME: np.array([reading.time for reading in beam], np.float64),
             layout.BEAM_VALUE: np.array([reading.value for reading in beam], np.float64),
         }
@@ -225,32 +238,43 @@ class NXtomoWriter:
         texts = {
             layout.END_TIME: layout.iso_time(self._clock.now()),
             layout.FIELD_OF_VIEW: layout.field_of_view(self._file),
-            layout.STATUS: status,
         }
         for path, text in texts.items():
             if text and path in self._last:
                 self._last[path][()] = text.encode()
+        state_ending(self._last, ending)
         self._file.flush()
         self._last[layout.FINISHED][()] = 1
         self._file.flush()
         self._to_disk.finish(self._committed)
         try:
             self._file.close()
+            if (head := superblock(self.path)) is None or not head.intact or head.missing:
+                raise _TouchedError(errno.EIO, "it is not as it was written")
         except FAILURES:
             self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
             raise
 
-    def _let_go(self) -> None:
+    def _let_go(self, reason: str) -> None:
         """Mark the end where there is room for it already, and leave the rest as a dead writer would.
 
         Readers see every frame committed.
         """
         try:
-            for path, value in ((layout.STATUS, b"failed"), (layout.FINISHED, 1)):
-                self._last[path][()] = value
+            state_words(self._last, Ending("failed", reason=reason))
+            self._last[layout.FINISHED][()] = 1
+            for path in (layout.REASON, layout.STATUS, layout.FINISHED):
                 self._last[path].flush()
         finally:
             hdf5.never_close(self._file)
+
+    def _require_untouched(self) -> None:
+        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        now = os.fstat(self._handle)
+        if now.st_nlink < self._before.st_nlink:
+            raise _TouchedError(errno.ENOENT, "it was deleted")
+        if now.st_size < self._before.st_size:
+            raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""
@@ -266,6 +290,12 @@ class NXtomoWriter:
             raise DataError(f"Frame {frame.index} is not written to {self.path}: {wrong}. The rows before are safe.")
 
     def _disk_error(self, what: str, error: Exception) -> DataError:
+        if isinstance(error, _TouchedError):
+            return DataError(
+                f"{self.path} was touched by another program while it was written: {error.strerror}. Of the "
+                f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
+                "the copy, and scan again."
+            )
         free = shutil.disk_usage(self.path.parent).free
         return DataError(
             f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import bring_to_disk, refuse_existing, whole_file
+from beamline.core.files import bring_to_disk, refuse_existing, replaceable, whole_file
 from beamline.storage import hdf5
 from beamline.storage.scratch import reserve
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
@@ -161,7 +161,9 @@ def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = F
     Raises:
         DataError: `target` exists and `replace` is not set, or the disk refuses; the partial volume stays.
     """
-    if not replace:
+    if replace:
+        target = replaceable(target)
+    else:
         refuse_existing(target)
     try:
         _save_structure(path)

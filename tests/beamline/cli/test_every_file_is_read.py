@@ -170,3 +170,28 @@ def test_views_of_a_model_give_its_volume_again(written: Path, tmp_path: Path) -
         assert again.length_unit == "mm" and again.volume.grid.spacing == pytest.approx(model.volume.grid.spacing)
         pair = np.ravel(again.volume.data[:]), np.ravel(model.volume.data[:])
         assert np.corrcoef(*pair)[0, 1] > 0.97
+
+
+OTHERS: dict[str, tuple[str, ...]] = {
+    "model.ply": ("export", "fit.h5", "--gaussians", "-o"),
+    "mesh.stl": ("surface", "fbp.h5", "-o"),
+    "sheet.png": ("monitor", "simulated.h5", "--sheet"),
+    "histogram.png": ("info", "simulated.h5", "--statistics", "-o"),
+    "checkpoint.h5": ("recon", "simulated.h5", "-m", "r2", "--steps", "9", "-o", "v.h5", "--no-report", "--checkpoint"),
+    "log.txt": ("recon", "simulated.h5", "-m", "fbp", "-o", "v.h5", "--no-report", "--log"),
+    "axis.png": ("recon", "simulated.h5", "-m", "fbp", "--axis", "try:14:17:1", "-o"),
+    "study": ("study", "fixed-views", "simulated.h5", "-o"),
+    "tradeoff": ("tradeoff", "simulated.h5", "-o"),
+    "batch": ("batch", "simulated.h5", "-o"),
+}
+
+
+@pytest.mark.parametrize("name", [*SCANS, *FLOATS, *GREYS, *LABELS, *OTHERS])
+def test_no_output_takes_the_place_of_a_link(written: Path, tmp_path: Path, name: str) -> None:
+    """As one to a disk that is not mounted."""
+    command = {**SCANS, **FLOATS, **GREYS, **LABELS, **OTHERS}[name]
+    away, link = tmp_path / "away", tmp_path / name
+    link.symlink_to(away)
+    done = beamline(*command, str(link))
+    assert (done.exit_code, link.is_symlink(), os.listdir(tmp_path)) == (5, True, [name]), done.output
+    assert f"{link} is a link to {away}, which is not there" in done.output and "deleted" not in done.output

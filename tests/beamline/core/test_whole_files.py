@@ -62,3 +62,26 @@ def test_what_a_killed_program_left_is_removed_by_the_next_that_writes_there(tmp
             partial.write_bytes(b"whole")
         process.kill()
     assert path.read_bytes() == b"whole"
+
+
+def test_a_link_to_what_is_not_there_is_never_replaced(tmp_path: Path) -> None:
+    """As to a disk that is not mounted; the links of a folder on the way count, too."""
+    (tmp_path / "link").symlink_to("away/out")
+    for path in (tmp_path / "link", tmp_path / "link" / "below" / "out.h5"):
+        for replace in (False, True):
+            with pytest.raises(DataError, match=r"link is a link to away/out, which is not there.*Nothing was written"):
+                write_whole(path, "new", replace=replace)
+    with pytest.raises(DataError, match="is a link to"), whole_file(tmp_path / "late") as partial:
+        partial.write_text("new")
+        (tmp_path / "late").symlink_to("away/out")  # made while the file was written
+    assert {*tmp_path.iterdir()} == {tmp_path / "link", tmp_path / "late"}
+
+
+def test_where_a_file_is_replaced_a_link_to_it_stays(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "out").write_text("old")
+    (tmp_path / "link").symlink_to("disk/out")
+    write_whole(tmp_path / "link", "new", replace=True)
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk" / "out").read_text() == "new"
+    with pytest.raises(DataError, match="never overwritten"):
+        write_whole(tmp_path / "link", "newer")

@@ -119,7 +119,7 @@ def test_the_bytes_predicted_are_what_the_file_takes(tmp_path: Path, preview_bin
     events: list[Event] = []
     result = run_scan(config, tmp_path, [events.append])
     predicted = next(event.data["total_bytes"] for event in events if event.event == "run_started")
-    assert 0 < result.bytes - predicted < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
+    assert 0 < result.bytes - predicted < 152_000  # numbers of each frame, in chunks of 4 kB, and the metadata
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])

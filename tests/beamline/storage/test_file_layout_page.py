@@ -128,7 +128,11 @@ def test_the_flags() -> None:
 
 
 def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
-    path = write_exchange(tmp_path / "exchange.h5", SCAN)
+    path = tmp_path / "scan.h5"
+    with NXtomoWriter(path, ScanInfo("s", pixel_size_mm=0.5), SCAN.shape, clock=StandingClock()) as writer:
+        for frame in frames_of(SCAN):
+            writer.append(frame, digest(frame.counts))
+        writer.close("stopped", reason="Enough.")
     events: list[dict[str, object]] = []
     fit = ["--method", "r2", "--steps", "20", "--gaussians", "300", "--checkpoint", str(tmp_path / "checkpoint.h5")]
     poses = tmp_path / "poses.csv"
@@ -141,6 +145,7 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.output
         events += [json.loads(line) for line in done.stdout.splitlines()]
     record = read_reconstruction(tmp_path / "bars.h5")
+    assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
     write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
     series = VolumesInTime(np.zeros(2), np.stack([record.volume.data] * 2))
     write_reconstruction(tmp_path / "series.h5", replace(record, series=series))

@@ -130,6 +130,7 @@ def test_a_disk_that_fails_says_what_became_of_the_file(
 
     with monkeypatch.context() as patch:
         patch.setattr(journal, "to_disk", fsync)
+        patch.setattr(journal, "folder_to_disk", fsync)
         with pytest.raises(DataError, match="Input/output error.*run `beamline recover`" if kept else "as it was"):
             changes.carry_out()
     assert journal_of(path).exists() == kept

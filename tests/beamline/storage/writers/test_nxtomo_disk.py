@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -247,3 +248,29 @@ def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
         assert source.refresh() == 3
         assert all((source.read([i])[0] == frames[i].counts).all() for i in range(3))
         assert source.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)
+
+
+def _cut(path: Path) -> None:
+    os.truncate(path, 0)
+
+
+def _cut_in_half(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows lets nobody touch a file that is open")
+@pytest.mark.parametrize("at", [5, 14])
+@pytest.mark.parametrize(("touch", "said"), [(_cut, "to 0 bytes"), (_cut_in_half, "was cut"), (Path.unlink, "deleted")])
+def test_a_file_that_another_program_touches_ends_the_scan(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
+) -> None:
+    """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    with pytest.raises(DataError, match=f"touched by another program while it was written: .*{said}"):
+        for frame in frames:
+            if frame.index == at:
+                touch(writer.path)
+            writer.append(frame, digest(frame.counts))
+        touch(writer.path)
+        writer.close()
+    writer.close("failed")
