@@ -179,7 +179,7 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
     while True:
         try:
             step()
-        except Exception as error:  # after any error the next step must be tried
+        except BaseException as error:  # after any error, also SystemExit of a plug-in, the next step must be tried
             if clock.now() > deadline:
                 say(f"{error} LOOK AT THE INSTRUMENT before anybody goes near the beam.")
                 return False
