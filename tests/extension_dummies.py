@@ -121,13 +121,13 @@ class Dummy:
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
-from beamline.scan import run
+from beamline.scan import recorder
 from beamline.scan.run import run_scan
 from beamline.storage.describe import describe
 import h5py
 from pathlib import Path
 
-run.rehearse = lambda monitor: None  # for what is compiled; it would take minutes without
+recorder.rehearse = lambda monitor, begin: None  # for what is compiled; it would take minutes without
 
 words = ["simulation.clock=virtual", "scan.angles.views=6", "devices.camera.roi=[1140, 2008, 24, 80]"]
 words += ["scan.darks.count=2", "scan.flats.count=2", "scan.flats.at=start", "scan.period_s=2", "scan.mode=step"]

@@ -24,7 +24,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Event, RunStarted, Sink
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
-from beamline.scan.control import Verb, state_of, tell
+from beamline.scan.control import Verb, ask, state_of
 from beamline.scan.run import RunResult, run_scan
 from drivers.base.protocols import RotationStage
 
@@ -87,7 +87,9 @@ class TomoScan(Device):
         if self._folder is None:
             return
         try:
-            await asyncio.to_thread(tell, self._folder, verb)
+            asked = ask(self._folder, verb)
+            while asked.state() is None:  # an end of the plan need not wait for it
+                await asyncio.sleep(POLL)
         except ConfigError:
             if self._task is not None and not self._task.done() and not state_of(self._folder).ended:
                 raise

@@ -171,7 +171,7 @@ class LazyGroup(click.Group):
             return super().invoke(ctx)
         except (Exit, Abort, ClickException):
             raise
-        except (Exception, KeyboardInterrupt) as error:
+        except BaseException as error:  # SystemExit, too, which is 0 by itself: no command of ours raises it
             said = user_message(error)
             if is_defect(error):
                 if ctx.params.get("debug"):

@@ -130,7 +130,7 @@ def json_events(wanted: bool) -> Iterator[Sink]:
         yield fan_out(last.append, lines)
     except (Exit, ClickException):
         raise
-    except (Exception, KeyboardInterrupt) as error:
+    except BaseException as error:
         if not (last and last[-1].event in ("done", "failed")):
             lines(Failed(user_message(error), exit_code(error), time=SystemClock().now()))
         raise

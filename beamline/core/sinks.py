@@ -45,9 +45,10 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
             return
         try:
             sink(event)
-        except Exception as error:
+        except BaseException as error:  # of somebody's code; SystemExit would end the announcer in silence
             works = False
-            others(Warned(f"An output of events failed and gets no further events: {error}", time=event.time))
+            why = f"{type(error).__name__}: {error}"
+            others(Warned(f"An output of events failed and gets no further events: {why}", time=event.time))
 
     return send
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
@@ -14,7 +14,7 @@ from typing import Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.page.run_files import Reader, watched
-from beamline.scan.control import Verb, tell
+from beamline.scan.control import Asked, Verb, ask
 from beamline.scan.runs import DIED, newest
 from beamline.scan.states import State
 from beamline.storage.hdf5 import NotReadyError
@@ -226,7 +226,7 @@ class RunServer:
         self._runs, self._say, self._now = runs, say, now
         self._reader: Reader | None = None
         self._values, self._lines, self._beats = StampedValues(RunValues(), now()), 0, 0
-        self._busy = threading.Lock()
+        self._asked: deque[tuple[Any, Any, Asked]] = deque()  # PVs whose clients wait, with their operations
         provider, self._shown = StaticProvider("splatline"), dict[str, Any]()
         for each in fields(RunValues):
             about = {"display.description": each.metadata["about"], "display.units": each.metadata["unit"]}
@@ -253,7 +253,10 @@ class RunServer:
         return dict(self._server.conf())
 
     def look(self) -> None:
-        """Look at the run, and post what has been set since, with the time and the alarm of what set it."""
+        """Answer clients whose verbs are done. Look at the run, and post what has been set since, with the time and the
+        alarm of what set it."""
+        for _ in range(len(self._asked)):
+            self._answer(*self._asked.popleft())
         now, before = self._read(), self._values
         for each in fields(RunValues):
             value, stamp = getattr(now.values, each.name), now.stamp(each.name)
@@ -293,26 +296,38 @@ class RunServer:
         return values.unreadable(why) if seen is None else values.with_file(seen, self._now())
 
     def _verb(self, verb: Verb) -> Callable[[Any, Any], None]:
-        """A handler of a PV: true sends the verb to the run, and the PV is false again."""
+        """A handler of a PV: true sends the verb to the run at once, and the PV is false again. `look` answers the
+        client when the verb is done: a verb never waits for another one."""
 
         def put(pv: Any, op: Any) -> None:
             if not bool(op.value()):
                 op.done()
                 return
             self._say(f"{verb} from {op.peer()}")
-            stamp = Stamp(self._now())
             try:
-                with self._busy:
-                    tell(newest(self._runs), verb)
+                self._asked.append((pv, op, ask(newest(self._runs), verb)))
             except (BeamlineError, OSError) as error:
-                stamp = replace(stamp, severity=Severity.MAJOR, message=user_message(error))
-                pv.post(_posted(False, stamp))
-                op.done(error=stamp.message)
-            else:
-                pv.post(_posted(False, stamp))
-                op.done()
+                self._refuse(pv, op, error)
 
         return put
+
+    def _answer(self, pv: Any, op: Any, asked: Asked) -> None:
+        """Answer the client of a verb that is done; one that is not yet waits for the next look."""
+        try:
+            done = asked.state() is not None
+        except (BeamlineError, OSError) as error:
+            self._refuse(pv, op, error)
+            return
+        if done:
+            pv.post(_posted(False, Stamp(self._now())))
+            op.done()
+        else:
+            self._asked.append((pv, op, asked))
+
+    def _refuse(self, pv: Any, op: Any, error: Exception) -> None:
+        stamp = Stamp(self._now(), Severity.MAJOR, user_message(error))
+        pv.post(_posted(False, stamp))
+        op.done(error=stamp.message)
 
 
 def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -19,8 +20,8 @@ _BEFORE_GHOST = 36  # views
 _REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
 
 
-def rehearse(monitor: Monitor) -> None:
-    """Let the checks of a monitor look at a few small frames; the monitor does not change.
+def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None) -> None:
+    """Let the checks of a monitor look at a few small frames; the monitor does not change. `begin`: as of `look`.
 
     numba keeps what it compiles: once on a machine it takes up to a minute, then a fraction of a second, and nothing
     for the next scan of the process with the same checks. A check that fails here will say so in the scan.
@@ -44,5 +45,5 @@ def rehearse(monitor: Monitor) -> None:
         counts[row, row] = 60_000  # a spot
         frame = Frame(counts, kind, row, row, row, _STEP * row, 1.8e9 + row, 0.1)
         with suppress(CheckError):
-            toy, _ = look(toy, frame, digests(counts, _SATURATION, _BIN)[0])
+            toy, _ = look(toy, frame, digests(counts, _SATURATION, _BIN)[0], begin)
     _REHEARSED.add(checks)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of
-from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, more_light
+from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.scatter import running_mean
@@ -92,22 +94,52 @@ def without(monitor: Monitor, name: str) -> Monitor:
     return replace(monitor, checks=tuple(check for check, _ in kept), states=tuple(state for _, state in kept))
 
 
-def look(monitor: Monitor, frame: Frame, digest: FrameDigest) -> tuple[Monitor, tuple[Flag, ...]]:
+def look(
+    monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
+) -> tuple[Monitor, tuple[Flag, ...]]:
     """Look at the next frame: the monitor after it, and what the checks found. O(blocks of the preview).
 
+    Args:
+        begin: is called with the name of each check before it looks.
+
     Raises:
-        CheckError: a check raised. The monitor that came in is as it was: go on `without` that check.
+        CheckError: a check raised, whatever it was, or returned what is no `Look`. The monitor that came in is as it
+            was: go on `without` that check.
     """
     monitor = _with_view(monitor, frame, digest)
     looks: list[Look[Any]] = []
     for check, state in zip(monitor.checks, monitor.states, strict=True):
+        begin(check.name)
         try:
-            looks.append(check.look(state, frame, digest, monitor.context))
-        except Exception as error:
+            looks.append(_valid(check.look(state, frame, digest, monitor.context), check.name, frame.index))
+        except BaseException as error:  # a plug-in may call sys.exit
+            if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
+                raise  # Ctrl-C
             raise CheckError(check.name) from error
     after = replace(_with_reference(monitor, frame, digest), before=digest, states=tuple(look.state for look in looks))
     unbroken = frame.index - after.counted + 1
     return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)
+
+
+def _valid(answer: Any, name: str, at: int) -> Look[Any]:
+    """What the check of this name returned at a frame. TypeError, ValueError: a scan cannot go on with it."""
+    if not isinstance(answer, Look) or type(answer.flag) not in (Flag, type(None)):
+        raise TypeError(f"it returned {answer!r:.80}; expected a Look with a Flag or None")
+    if (flag := answer.flag) is None:
+        return answer
+    rows, boxes = (flag.frame if flag.first is None else flag.first, flag.frame), (flag.region, flag.from_region)
+    numbers = (flag.score, flag.limit, *(side for box in boxes for side in box or ()))
+    typed = (
+        isinstance(flag.level, Level)
+        and isinstance(flag.advice, str)
+        and all(isinstance(row, Integral) for row in rows)
+        and all(isinstance(number, Real) for number in numbers)
+    )
+    if not typed or any(len(box) != 4 for box in boxes if box is not None):
+        raise TypeError(f"its flag has a field of another type: {flag!r:.300}")
+    if flag.check != name or not 0 <= rows[0] <= rows[1] <= at:
+        raise ValueError(f"its flag is of {flag.check!r}, rows {rows[0]} to {rows[1]}; expected {name!r}, up to {at}")
+    return answer
 
 
 def _from(flag: Flag, row: int) -> Flag:

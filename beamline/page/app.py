@@ -34,7 +34,7 @@ from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import number_of, region_of, tile_of
 from beamline.page.viewer import reader_of, viewer_routes
 from beamline.page.volume import ShownVolume
-from beamline.scan.control import Verb, tell
+from beamline.scan.control import POLL, Verb, ask
 
 COOKIE = "splatline_look_"
 """Name of the cookie, before the port: a browser sends a cookie to all ports of a host."""
@@ -247,7 +247,8 @@ class _Server:
                 picture = (run / PICTURE).read_bytes()
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
-    def verb(self, request: Request) -> Response:
+    async def verb(self, request: Request) -> Response:
+        """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
         folder, act = self._reader.what.folder, self._access.act
         name, client = request.path_params["verb"], request.client.host if request.client else "?"
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
@@ -257,4 +258,7 @@ class _Server:
         if folder is None or name not in [str(verb) for verb in Verb]:
             return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
         self._log(f"{name}, asked for from {client}")
-        return JSONResponse({"state": str(tell(folder, Verb(name)))})
+        asked = ask(folder, Verb(name))
+        while (state := await run_in_threadpool(asked.state)) is None:
+            await asyncio.sleep(POLL)
+        return JSONResponse({"state": str(state)})

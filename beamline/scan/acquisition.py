@@ -127,16 +127,16 @@ class Acquisition:
             self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
             monochromator.move_to(energy)
         for block in self._timeline.blocks:
-            if self._stop.aborting:
-                raise ScanAborted(f"Aborted: {self._stop.reason}.")
+            self._stop.refuse_abort()
             if not block.left:
                 self._done.append(TakenBlock(block, Taken()))
                 continue
-            if self._stop.stopping and not self._still_needed(block):
-                continue
-            if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):
+            views = block.kind is FrameKind.PROJECTION and not self._stop.stopping
+            if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
+            if self._stop.stopping and not self._still_needed(block):
+                continue
             if block.kind is FrameKind.ALIGNMENT:
                 yield from self._on_the_way_back(block)
                 continue
@@ -276,20 +276,20 @@ class Acquisition:
             self._set_shutter_and_sample(block.kind)
             states.enter(_state_of(block), "The scan goes on")
 
-    def _make_safe(self, home: float | None) -> list[Exception]:
+    def _make_safe(self, home: float | None) -> list[BaseException]:
         """Stop the stage, disarm, close the shutter; all steps are tried. Returns the first error of each one."""
         stage, camera, shutter = self._devices.stage, self._devices.camera, self._devices.shutter
-        failed: list[Exception] = []
+        failed: list[BaseException] = []
 
         def attempt(*ways: Callable[[], object]) -> bool:
             """Try one action after the other until one works: a serial line that failed once often works again."""
-            failures: list[Exception] = []
+            failures: list[BaseException] = []
             for way in ways:
                 try:
                     way()
                 except ScanAborted:  # requested while the stage was moving here
                     return attempt(stage.abort, stage.abort)
-                except Exception as error:  # a failure of one device must not leave the others unsafe
+                except BaseException as error:  # a failure of one device must not leave the others unsafe
                     failures.append(error)
                 else:
                     for failure in failures:
@@ -358,7 +358,7 @@ def _state_of(block: Block) -> State:
     return State.DARKS if block.kind is FrameKind.DARK else State.FLATS
 
 
-def _in_words(error: Exception) -> str:
+def _in_words(error: BaseException) -> str:
     """The message of an error; with its type if it is not ours."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 

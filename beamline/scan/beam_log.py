@@ -72,7 +72,7 @@ class BeamLog:
         self._begun += 1
         try:
             reading = monitor.reading()
-        except Exception as error:  # no failure of the beam monitor ends the scan
+        except BaseException as error:  # no failure of the beam monitor ends the scan
             self._fail(monitor.name, error)
         else:
             self._enter(monitor.name, reading)
@@ -89,7 +89,7 @@ class BeamLog:
         if self._react is not None:
             self._react(reading)
 
-    def _fail(self, name: str, error: Exception) -> None:
+    def _fail(self, name: str, error: BaseException) -> None:
         self._failed += 1
         if self._failed > 1 or self._over.is_set():
             return

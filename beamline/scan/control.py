@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 
 POSIX = os.name == "posix"  # the system has owners and modes, and can hold a folder open
-_POLL = 0.1  # real s between checks
+POLL = 0.1  # real s between checks
 _ANSWER = 5.0  # real s within which a scan accepts a verb
 _EFFECT = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
 
@@ -109,7 +110,7 @@ def verbs_taken(
 
     def take_verbs() -> None:
         told = False
-        while not over.wait(_POLL):
+        while not over.wait(POLL):
             if fault := requests.fault():
                 if not told:
                     message = f"No verb from another terminal is done: {place}: {fault}. Ctrl-C here stops the scan."
@@ -149,11 +150,38 @@ def running(runs: Path) -> list[Path]:
     return sorted(run for run, part in newest if (part / CONTROL).is_dir() and held(part / SCAN))
 
 
-def tell(run: Path, verb: Verb) -> State:
-    """Send a verb to a running scan, and wait until it is done, or for 20 s; returns the scan's state.
+@dataclass(frozen=True)
+class Asked:
+    """A verb on its way to the scan of a part of a run, since a time on the monotonic clock."""
+
+    part: Path
+    verb: Verb
+    since: float
+
+    def state(self) -> State | None:
+        """The scan's state once the verb is done, or after 20 s; None before that. Returns at once.
+
+        Raises:
+            ConfigError: the scan has not answered for 5 s; the request is withdrawn.
+        """
+        request, seconds = self.part / CONTROL / self.verb, time.monotonic() - self.since
+        if request.exists():
+            if seconds < _ANSWER:
+                return None
+            if _taken(request):
+                raise ConfigError(
+                    f"the scan in {self.part} does not answer: it has died, or its disk hangs. Nothing was changed. If "
+                    "it has died, look at the instrument, and run `beamline recover` on its file."
+                )
+        state = state_of(self.part)
+        return state if _done(state, self.verb) or seconds > _EFFECT else None
+
+
+def ask(run: Path, verb: Verb) -> Asked:
+    """Send a verb to a running scan. It waits for nothing, so that nothing is in the way of the next verb.
 
     Raises:
-        ConfigError: no scan runs there, or somebody else's, or none that answers within 5 s; the request is withdrawn.
+        ConfigError: no scan runs there, or somebody else's.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
@@ -173,13 +201,15 @@ def tell(run: Path, verb: Verb) -> State:
         raise DataError(
             f"{run} cannot be told to {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
         ) from error
-    if not _within(_ANSWER, lambda: not request.exists()) and _taken(request):
-        raise ConfigError(
-            f"the scan in {run} does not answer: it has died, or its disk hangs. Nothing was changed. If it has died, "
-            "look at the instrument, and run `beamline recover` on its file."
-        )
-    _within(_EFFECT, lambda: _done(state_of(part), verb))
-    return state_of(part)
+    return Asked(part, verb, time.monotonic())
+
+
+def tell(run: Path, verb: Verb) -> State:
+    """Send a verb to a running scan, and wait until it is done; returns the state. Errors: of `ask` and `Asked`."""
+    asked = ask(run, verb)
+    while (state := asked.state()) is None:
+        time.sleep(POLL)
+    return state
 
 
 def state_of(run: Path) -> State:
@@ -200,10 +230,3 @@ def _done(state: State, verb: Verb) -> bool:
     if verb in (Verb.PAUSE, Verb.RESUME):
         return (state is State.PAUSED) is (verb is Verb.PAUSE)
     return False
-
-
-def _within(seconds: float, met: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + seconds
-    while not (now := met()) and time.monotonic() < deadline:
-        time.sleep(_POLL)
-    return now

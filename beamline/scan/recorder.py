@@ -2,7 +2,8 @@
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
 frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
-of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same.
+of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same. Where a
+check does not come back, the second thread goes on without the first.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import FrameFlagged, FrameStored, Sink, Warned
-from beamline.core.stop import PauseRequest
+from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.text import count, spans
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digests
+from beamline.monitor.rehearsal import rehearse
 from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
@@ -39,7 +42,11 @@ WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the threads
 LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
-STALL = 60.0  # real s without a written frame, after which the disk counts as dead
+STALL = 60.0  # real s that a write may take, after which the disk counts as dead
+SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
+CHECKS = 60.0  # real s that the checks may take for a frame, after which they count as hanging
+COMPILES = 300.0  # the same of their rehearsal, which compiles once on a machine
+STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
 
@@ -66,8 +73,10 @@ def frames_in_memory(timeline: Timeline) -> int:
     return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
 
 
-_Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...]]
-"""A frame, its digests for the checks and for the file, and the flags."""
+_Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...] | None]
+"""A frame, its digests for the checks and for the file, and the flags; None: no check has looked at it."""
+_Item = _Checked | BaseException | threading.Event | None
+"""What comes to the second thread; an exception: the frame could not be digested."""
 
 
 class Recorder:
@@ -77,11 +86,13 @@ class Recorder:
 
     No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
     so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
-    raise DataError where a frame could not be written, or the disk has taken none for STALL.
+    raise DataError where a frame could not be written, or a write takes longer than STALL. A stop or an abort waits for
+    neither disk nor checks: what the camera still owes is kept in memory.
 
     Args:
         react: told the flags of each frame.
         pause: a request that pauses the scan.
+        stop: the scan's.
         retaken_warnings: checks whose warnings have views taken again.
 
     Attributes:
@@ -100,13 +111,21 @@ class Recorder:
         sink: Sink,
         react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
         pause: PauseRequest | None = None,
+        stop: StopRequest | None = None,
         retaken_warnings: frozenset[str] = frozenset(),
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
         self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._progress = _Progress(timeline)
+        self._stop = stop or StopRequest()
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
+        self._unjudged: list[int] = []  # frames that the monitor did not look at
+        self._check_name = ""  # that looks, or looked last
+        self._under_checks: deque[tuple[Frame | None, float]] = deque()
+        """The frame that the first thread works on (None: the rehearsal), and since when. Whoever takes it out hands it
+        on: the first thread, or the second one, which goes on alone from then on."""
+        self._alone = False
         self.n_frames = 0
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
@@ -114,11 +133,11 @@ class Recorder:
         self._invalid: set[int] = set()  # rows that never were anything else
         self.retaken, self._retaking = 0, False
         self.references = ReferenceLog()
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None
         self._work = Workload()
         most = room(timeline)
         self._waiting: Queue[Frame | threading.Event | None] = Queue(most)
-        self._checked: Queue[_Checked | Exception | threading.Event | None] = Queue(CHECKED_FRAMES)
+        self._checked: Queue[_Item] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
         pause, views = pause or PauseRequest(), timeline.views
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
@@ -141,25 +160,32 @@ class Recorder:
 
     def check(self) -> None:
         """Check whether the disk answers, while no frames come."""
-        if time.monotonic() - self._busy_since > STALL:
-            raise self._stalled()
+        self._refuse_stall()
         self._raise_failure()
 
     def wait(self) -> None:
-        """Wait until every frame that was put is written, and go on."""
+        """Wait until the checks are compiled and every frame that was put is written, or a stop is requested."""
         reached = threading.Event()
         self._enqueue(reached)
-        self._wait_until(lambda: reached.wait(STALL))
+        while not reached.wait(SLICE) and not self._stop.stopping:
+            self._refuse_stall()
+        self._raise_failure()
 
     def finish(self) -> None:
         """Wait until every frame that was put is written; no other may follow."""
-
-        def ended() -> bool:
-            self._thread.join(STALL)
-            return not self._thread.is_alive()
-
         self._enqueue(None)
-        self._wait_until(ended)
+        while self.hangs:
+            self._refuse_stall()
+            self._thread.join(SLICE)
+        self._raise_failure()
+
+    @property
+    def unjudged(self) -> str:
+        """Which frames so far the monitor did not look at, in words; "" where it has looked at all."""
+        if not self._unjudged:
+            return ""
+        frames = f"{count(len(self._unjudged), 'frame')} ({spans(self._unjudged)})"
+        return f"The monitor did not look at {frames}: they have no flags. `beamline monitor {self._writer.path}` does."
 
     @property
     def flags(self) -> dict[str, dict[str, int]]:
@@ -210,22 +236,19 @@ class Recorder:
 
     def _enqueue(self, item: Frame | threading.Event | None) -> None:
         """Queue a frame, an event to be set when its turn comes, or None after the last frame."""
-        try:
-            self._waiting.put(item, timeout=STALL)
-        except Full:
-            raise self._stalled() from None
+        while True:
+            if self._stop.aborting or (self._stop.stopping and self._flying):
+                self._waiting.maxsize = 0  # the stage turns before an open shutter: it stands first
+            try:
+                self._waiting.put(item, timeout=SLICE)
+            except Full:
+                self._refuse_stall()
+            else:
+                return
 
-    def _wait_until(self, over: Callable[[], bool]) -> None:
-        """Wait, by calls of `over` that last STALL at most, as long as frames are written."""
-        written = self.n_frames
-        while not over():
-            if written == self.n_frames:
-                raise self._stalled()
-            written = self.n_frames
-        self._raise_failure()
-
-    def _stalled(self) -> DataError:
-        return DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
+    def _refuse_stall(self) -> None:
+        if time.monotonic() - self._busy_since > STALL:
+            raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
 
     def _raise_failure(self) -> None:
         cause = self._failure
@@ -240,32 +263,90 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _check_frames(self) -> None:
-        """The first thread: digests and checks. A frame that it cannot digest fails at its turn to be written."""
-        while (item := self._next()) is not None:
-            checked: _Checked | Exception | threading.Event
-            if isinstance(item, threading.Event):
-                checked = item
-            elif self._failure is not None:
-                continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
-            else:
-                begun, cpu = time.monotonic(), time.thread_time()
-                try:
-                    seen, stored = digests(item.counts, self._monitor.context.saturation, self._preview_bin)
-                    checked = item, seen, stored, self._look(_as_stored(item), seen)
-                except Exception as error:
-                    checked = error
-                self._work.checking += time.monotonic() - begun
-                self._work.checking_cpu += time.thread_time() - cpu
+        """The first thread: digests and checks, until the last frame, or until the second one goes on alone."""
+        self._under_checks.append((None, time.monotonic()))
+        self._rehearse()
+        if not self._taken_out():
+            return
+        while isinstance(item := self._next(), Frame | threading.Event):
+            checked: _Item = item if isinstance(item, threading.Event) else None
+            if isinstance(item, Frame):
+                if self._failure is not None:
+                    continue  # frames after a failure are discarded, so that `put` does not wait for room
+                self._under_checks.append((item, time.monotonic()))
+                checked = self._digested(item)
+                if not self._taken_out():
+                    return
             self._checked.put(checked)
         self._checked.put(None)
 
+    def _taken_out(self) -> bool:
+        """Take out what the first thread has worked on; False where the second one has done so."""
+        with suppress(IndexError):
+            self._under_checks.pop()
+            return True
+        return False
+
+    def _rehearse(self) -> None:
+        """Compile what the checks need, before the first frame. An error costs no frame."""
+        try:
+            rehearse(self._monitor, self._begin_check)
+        except BaseException as error:
+            self._monitor_off = True
+            self._sink(Warned(f"the monitor failed in its rehearsal and is off: {error!r}"))
+
+    def _begin_check(self, name: str) -> None:
+        self._check_name = name
+
+    def _digested(self, frame: Frame) -> _Item:
+        """A frame with its digests and flags, or why it has none: it then fails at its turn to be written."""
+        begun, cpu = time.monotonic(), time.thread_time()
+        try:
+            seen, stored = digests(frame.counts, self._monitor.context.saturation, self._preview_bin)
+            return frame, seen, stored, self._look(_as_stored(frame), seen)
+        except BaseException as error:
+            return error
+        finally:
+            self._work.checking += time.monotonic() - begun
+            self._work.checking_cpu += time.thread_time() - cpu
+
+    def _next_checked(self) -> _Item:
+        """The next item of the second thread, which digests frames itself once the checks hang."""
+        while True:
+            with suppress(Empty):
+                return self._checked.get(not self._alone, SLICE)
+            if self._alone:
+                item = self._next()
+                return self._digested(item) if isinstance(item, Frame) else item
+            self._give_up_checks_that_hang()
+
+    def _give_up_checks_that_hang(self) -> None:
+        """Switch the monitor off where it takes too long, and take its frame; the first thread may hang for ever."""
+        with suppress(IndexError):  # it has come back
+            frame, since = self._under_checks[0]
+            usual = COMPILES if frame is None else CHECKS
+            limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
+            if (seconds := time.monotonic() - since) <= limit:
+                return
+            frame, _ = self._under_checks.pop()
+            self._monitor_off = self._alone = True
+            where = "its rehearsal" if frame is None else f"frame {frame.index}"
+            self._sink(
+                Warned(
+                    f"The check {self._check_name} has not come back from {where} for {seconds:.0f} s. The monitor is "
+                    "off: frames from here on are stored without flags."
+                )
+            )
+            if frame is not None:
+                self._checked.put(self._digested(frame))
+
     def _write_frames(self) -> None:
         """The second thread: writes, and reports."""
-        item, flushed = self._checked.get(), True
+        item, flushed = self._next_checked(), True
         while True:
             begun, cpu = time.monotonic(), time.thread_time()
             try:
-                if isinstance(item, Exception):
+                if isinstance(item, BaseException):
                     raise item
                 if self._failure is None:
                     self._busy_since = time.monotonic()
@@ -276,8 +357,8 @@ class Recorder:
                     if not flushed and (nothing_waits or not isinstance(item, tuple)):
                         self._writer.flush()
                         flushed = True
-            except Exception as error:
-                with suppress(Exception):  # the first one counts
+            except BaseException as error:  # a plug-in may raise SystemExit, which would end this thread in silence
+                with suppress(BaseException):  # the first one counts
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
             self._work.writing += time.monotonic() - begun
@@ -287,7 +368,7 @@ class Recorder:
                 return
             if isinstance(item, threading.Event):
                 item.set()
-            item = self._checked.get()
+            item = self._next_checked()
 
     def _next(self) -> Frame | threading.Event | None:
         """The next item of the queue; checks the disk about once a second meanwhile."""
@@ -305,7 +386,10 @@ class Recorder:
         if self._backlog is not None:
             self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames wait in `put`
 
-    def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...]) -> None:
+    def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...] | None) -> None:
+        if flags is None:
+            self._unjudged.append(frame.index)
+            flags = ()
         self._writer.append(frame, stored, flags)
         self.references.add(frame, seen)
         self.n_frames += 1
@@ -318,21 +402,22 @@ class Recorder:
         if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
             self._sink(event)
 
-    def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...]:
-        """The monitor's flags. An error costs no frame: a check that raises is switched off, with a warning."""
+    def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...] | None:
+        """The monitor's flags; None where it is off. An error costs no frame: a check that raises is switched off, with
+        a warning."""
         if self._monitor_off:
-            return ()
+            return None
         try:
-            self._monitor, flags = look(self._monitor, frame, seen)
+            self._monitor, flags = look(self._monitor, frame, seen, self._begin_check)
         except CheckError as failed:
             self._monitor = without(self._monitor, failed.name)
             message = f"{failed} at frame {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
             self._sink(Warned(message))
             return self._look(frame, seen)
-        except Exception as error:
+        except BaseException as error:
             self._monitor_off = True
             self._sink(Warned(f"the monitor failed at frame {frame.index} and is off: {error!r}"))
-            return ()
+            return None
         return flags
 
     def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:

@@ -33,7 +33,6 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
-from beamline.monitor.rehearsal import rehearse
 from beamline.plan.retake import Retake, spread
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
@@ -227,7 +226,9 @@ class _Run:
                 leave_traceback(error, self.folder)
             self.states.enter(self._end_by(error), "Ended early")
             self.sink(Failed(user_message(error), exit_code(error), self.folder))
-            raise
+            if isinstance(error, Exception | KeyboardInterrupt):
+                raise
+            raise RuntimeError(f"{type(error).__name__}: {error}") from error  # SystemExit(0) would be success
         self.states.enter(State.DONE, "Finished")
         self.sink(RunDone(self.folder, result))
         return result
@@ -246,16 +247,14 @@ class _Run:
             if command is not None:
                 follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink, self.stop.stop_as_enough)
                 ending.callback(follower.close)
-            if self.config.simulation is None:
-                self._compiled(follower)
             return self._acquire_and_follow(writer, follower, release)
 
-    def _compiled(self, follower: LiveReconstruction | None) -> None:
+    def _compiled(self, recorder: Recorder, follower: LiveReconstruction | None) -> None:
         """Wait until the live reconstruction and the monitor have compiled, at the same time: once on a machine.
 
         A real scan waits before its first frame, a simulated one, whose references do not age, before its first view.
         """
-        rehearse(self.ready.monitor)
+        recorder.wait()
         if follower is not None:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
 
@@ -304,7 +303,7 @@ class _Run:
         acquisition = self._acquisition(recorder, beam, follower)
         labels = LabelLog()
         with beam:
-            error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
+            error = _failure_of(lambda: self._acquire(acquisition, recorder, labels, follower))
         self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
@@ -317,7 +316,7 @@ class _Run:
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
             error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
-        for remark in (*writer.remarks, *([drift] if (drift := recorder.drift) else [])):
+        for remark in filter(None, (*writer.remarks, recorder.drift, recorder.unjudged)):
             self.sink(Warned(remark))
         error = self._worse(error, _failure_of(release))
         path, n_frames = writer.path, writer.committed
@@ -363,7 +362,11 @@ class _Run:
             self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let it settle, fix it, or scan faster."))
         return found
 
-    def _acquire(self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog) -> None:
+    def _acquire(
+        self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
+    ) -> None:
+        if self.config.simulation is None:
+            self._compiled(recorder, follower)
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
@@ -406,6 +409,7 @@ class _Run:
             sink=self.sink,
             react=AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
             pause=self.pause,
+            stop=self.stop,
             retaken_warnings=monitor.retaken_warnings,
         )
 
@@ -425,7 +429,9 @@ class _Run:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
         recorder.wait()
         if self.config.simulation is not None:
-            self._compiled(follower)
+            self._compiled(recorder, follower)
+        if self.stop.stopping:
+            return None
         blocks = self.ready.timeline.blocks
         faults = self.references.faults(recorder.references, blocks[: blocks.index(self.ready.timeline.views)])
         if not faults or self.config.references.on_fault == "log":
@@ -443,6 +449,8 @@ class _Run:
         if not most:
             return ()
         recorder.wait()
+        if self.stop.stopping:
+            return ()
         lost = [Retake(-1, trigger) for trigger in missing]
         bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
         chosen = spread(bad, most)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import fields
 from pathlib import Path
@@ -38,6 +39,14 @@ def _until(server: RunServer, met: Callable[[], bool]) -> None:
         assert time.monotonic() < deadline
         server.look()
         time.sleep(0.1)
+
+
+def _put(server: RunServer, client: Any, name: str) -> None:
+    """Write true, and look as `beamline ioc` does, until the scan has obeyed."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(client.put, name, True, timeout=WITHIN)
+        _until(server, answer.done)
+    answer.result()
 
 
 def test_without_a_run_it_is_idle_and_beats(tmp_path: Path) -> None:
@@ -157,12 +166,12 @@ def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> Non
             assert scan.stderr is not None
             _until(server, lambda: client.get("T:ScanStatus") == "acquiring" and client.get("T:ImagesSaved") > 6)
             assert client.get("T:ImagesPlanned") > 2000 and client.get("T:FrameRate") > 0
-            client.put("T:PauseScan", True, timeout=WITHIN)
+            _put(server, client, "T:PauseScan")
             _until(server, lambda: client.get("T:ScanStatus") == "paused")
-            client.put("T:ResumeScan", True, timeout=WITHIN)
+            _put(server, client, "T:ResumeScan")
             _until(server, lambda: client.get("T:ScanStatus") == "acquiring")
             rate = client.get("T:FrameRate")
-            client.put("T:StopScan", True, timeout=WITHIN)
+            _put(server, client, "T:StopScan")
             scan.stderr.read()
             assert scan.wait(WITHIN) == 4
         _until(server, lambda: client.get("T:ScanStatus") == "stopped")

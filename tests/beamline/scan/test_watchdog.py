@@ -30,7 +30,8 @@ from tests.beamline.ball_scan import COMMON
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.simulators.wires.transports import serve_tcp
 
-OTHERS = (("pi_gcs", False), ("pm16c", False), *((("zaber", True),) if os.name == "posix" else ()))
+FREEZES = (("zaber", "scan"), ("zaber", "watchdog")) if os.name == "posix" else ()
+OTHERS = (("pi_gcs", ""), ("pm16c", ""), *FREEZES)
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}
 SCAN = """
 import sys, time
@@ -40,6 +41,7 @@ from beamline.instrument.connect import shutter_of, stage_alone
 from beamline.scan import watchdog
 from beamline.scan.watchdog import watched
 from drivers.base.clock import Clock, SystemClock
+watchdog.UNANSWERED = 10
 if len(sys.argv) > 2:
     watchdog.COMMAND = (sys.executable, "-c", sys.argv[2])
 folder, by_hand = Path(sys.argv[1]), []
@@ -54,7 +56,7 @@ HASTY = """
 import sys
 from pathlib import Path
 from beamline.scan import watchdog
-watchdog.FROZEN = 10.0
+watchdog.FROZEN = 6.0
 watchdog.main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer.raw)
 """
 posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets no such requests")
@@ -62,11 +64,12 @@ posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets
 
 @pytest.mark.parametrize(
     ("kind", "frozen"),
-    [("zaber", False), *(pytest.param(*one, marks=pytest.mark.slow) for one in OTHERS)],
+    [("zaber", ""), *(pytest.param(*one, marks=pytest.mark.slow) for one in OTHERS)],
 )
 def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
-    tmp_path: Path, kind: str, frozen: bool, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, kind: str, frozen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also one that is killed when the watchdog beside it is frozen, and its replacement is not there yet."""
     clock = SystemClock()
     line = TriggerLine(clock)
     template, outputs = config_folder() / "instrument.yaml", kind != "pm16c"
@@ -82,19 +85,28 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
     with serve_tcp(controller) as url:
         config = load(template, [*words, f"devices.stage.port={url}"], {})
         (tmp_path / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
-        command = [sys.executable, "-c", SCAN, str(tmp_path), *([HASTY] if frozen else [])]
+        command = [sys.executable, "-c", SCAN, str(tmp_path), *([HASTY] if frozen == "scan" else [])]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as scan:
             assert scan.stdout is not None and scan.stdout.readline().strip() == b"it turns"
             time.sleep(0.5)
             assert line.angle_at(clock.now()) > 0
             assert controller.output_is_high(2) is outputs
-            scan.send_signal(signal.SIGSTOP) if frozen else scan.kill()
+            if frozen == "watchdog":
+                (first,) = children_with("beamline.scan.watchdog", scan.pid)
+                first.suspend()
+                deadline = time.monotonic() + 60
+                while first in children_with("beamline.scan.watchdog", scan.pid) or not children_with(
+                    "beamline.scan.watchdog", scan.pid
+                ):
+                    assert time.monotonic() < deadline
+                    time.sleep(0.02)
+            scan.send_signal(signal.SIGSTOP) if frozen == "scan" else scan.kill()
         deadline, text = time.monotonic() + 60, ""
         while time.monotonic() < deadline and "disarmed" not in text:
             time.sleep(0.1)
             text = log.read_text(encoding="utf-8") if log.exists() else ""
         assert (
-            ("did nothing for 10 s and counts as dead" if frozen else "has died") in text
+            ("did nothing for 6 s and counts as dead" if frozen == "scan" else "has died") in text
             and "told to stop" in text
             and "disarmed" in text
         )
@@ -129,8 +141,12 @@ def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
 
     monkeypatch.setattr(watchdog, "make_safe", safe)
     monkeypatch.setattr(signal, "signal", lambda *how: None)
+    read, write = os.pipe()
+    os.close(read)  # the scan died before its watchdog was there, and takes no answer
+    monkeypatch.setattr(watchdog, "_STDOUT", write)
     assert watchdog.main(tmp_path, os.getpid(), io.BytesIO(b"...")) == watchdog.ACTED
     assert made == [False]
+    os.close(write)
 
 
 class _Scan:
@@ -170,9 +186,9 @@ def test_a_computer_that_slept_is_no_frozen_scan() -> None:
     assert not until_dead(signs, asleep)
 
 
-def children_with(word: str) -> list[psutil.Process]:
-    """Those of ours that run and have this in their command."""
-    running = [one for one in psutil.Process().children() if one.status() != psutil.STATUS_ZOMBIE]
+def children_with(word: str, parent: int | None = None) -> list[psutil.Process]:
+    """Those of ours, or of another process, that run and have this in their command."""
+    running = [one for one in psutil.Process(parent).children() if one.status() != psutil.STATUS_ZOMBIE]
     return [one for one in running if word in " ".join(one.cmdline())]
 
 
@@ -189,18 +205,22 @@ def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: 
     assert told == [] and not (tmp_path / WATCHDOG_LOG).exists()
 
 
-@pytest.mark.parametrize("paused", [False, True])
-def test_a_watchdog_that_died_is_told_and_replaced_or_the_scan_pauses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paused: bool
+@pytest.mark.parametrize(
+    ("then", "what", "paused"),
+    [("0", "has ended (code 0)", False), ("0", "has ended", True), ("__import__('time').sleep(99)", "does not", False)],
+)
+def test_a_watchdog_that_died_or_froze_is_told_and_replaced_or_the_scan_pauses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, then: str, what: str, paused: bool
 ) -> None:
     monkeypatch.setattr(watchdog, "BEAT", 0.01)
-    monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", "print('ready')"))  # it ends at once
+    monkeypatch.setattr(watchdog, "UNANSWERED", 5)
+    monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", f"print('ready', flush=True); {then}"))
     told, stop, pause = list[str](), StopRequest(), PauseRequest()
     with watched(tmp_path, lambda event: told.append(event.data["message"]), stop, pause if paused else None):
         deadline = time.monotonic() + 60
-        while not any("ended, too" in text for text in told) and time.monotonic() < deadline:
+        while not any(", too" in text for text in told) and time.monotonic() < deadline:
             time.sleep(0.01)
-    assert sum("another one is started" in text for text in told) == watchdog.AGAIN
+    assert sum(what in text and "another one is started" in text for text in told) == watchdog.AGAIN
     assert ("no watchdog runs" in pause.reason) is paused and not stop.stopping
 
 
