@@ -39,6 +39,11 @@ def _pipe(place: Path) -> None:
     os.mkfifo(place)
 
 
+def _endless(place: Path) -> None:
+    place.touch()
+    os.truncate(place, 2**40)
+
+
 _WAYS_OUT = {
     "link": lambda place: place.symlink_to("../secret"),
     "link to a file beside": lambda place: place.symlink_to("good"),
@@ -48,7 +53,7 @@ _WAYS_OUT = {
     "folder": lambda place: place.mkdir(),
     "nothing": lambda place: None,
     "too long": lambda place: place.write_bytes(bytes(9)),
-    "without end": lambda place: (place.touch(), os.truncate(place, 2**40)),
+    "without end": _endless,
 }
 
 
