@@ -6,9 +6,11 @@ name of the addition. A registry asks at its first use, so that programs without
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Collection
+from contextlib import redirect_stdout
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -36,15 +38,32 @@ def plugins(
             if point.name in taken or times[point.name] > 1:
                 by = "splatline" if point.name in taken else "another plug-in"
                 raise ValueError(f"the name is taken by {by}; expected a name of its own")
-            found[point.name] = made(point.name, point.load())
-        except (Exception, SystemExit) as error:  # another package's fault must not stop a scan
+            with redirect_stdout(sys.stderr):  # stdout is for results
+                found[point.name] = made(point.name, point.load())
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # another package's fault must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
+            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {_said(error)}"
             warnings.warn(
-                f"The {kind.replace('_', ' ')} {point.name!r}{package} ({point.value}) was left out: "
-                f"{type(error).__name__}: {error}. Mend or uninstall that package; all else works without it.",
+                f"The {kind.replace('_', ' ')} {_one_line(told)}. Mend or uninstall that package; all else works "
+                "without it.",
                 stacklevel=2,
             )
     return found
+
+
+def _said(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception as again:
+        return f"it does not say why ({type(again).__name__})"
+
+
+def _one_line(text: str) -> str:
+    """The text without control characters, which would act on a terminal or begin a line of a log; not too long."""
+    line = " ".join(text[:1000].split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
 
 
 @cache

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import collections.abc
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, dataclass_transform
+from types import UnionType
+from typing import Any, BinaryIO, ClassVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
+
+from beamline.core.process import json_object
 
 KINDS: dict[str, list[type[Event]]] = {}
 """The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
@@ -72,6 +79,72 @@ def event_of(values: Mapping[str, Any]) -> Event:
             taken: dict[str, Any] = {name: value for name, value in given.items() if name in named}
             return each(**taken | dict.fromkeys(spread, rest))
     raise ValueError(f"no kind of event has the values {dict(values)}")
+
+
+LONGEST = 2**20
+"""Most bytes of a line of a log: a scan with 100,000 missing triggers takes 700 kB to say so."""
+LARGEST_LOG = 2**30
+"""Bytes of a log that are read: those of a week with ten lines a second."""
+_LATEST = 2.0**34  # s since the Unix epoch: the year 2514, which the calendars of all systems reach
+
+
+def event_in(line: str | bytes) -> dict[str, Any] | None:
+    """The values of an event in a line of a log; None where it is none.
+
+    Whoever can write to the folder of a run wrote it: values of the fields that its kind has are of their types; fields
+    may lack or be unknown, as of another version of this program.
+    """
+    with suppress(UnicodeDecodeError):
+        text = line.decode() if isinstance(line, bytes) else line
+        values = json_object(text) if len(text) <= LONGEST else None
+        if values is None or not isinstance(values.get("event"), str):
+            return None
+        types = _types(values["event"])
+        time = values.get("time", 0.0)
+        fit = all(any(_fits(value, each) for each in types.get(name, (Any,))) for name, value in values.items())
+        return values if fit and time is not None and _fits(time, float) and abs(time) < _LATEST else None
+    return None
+
+
+@lru_cache
+def _types(event: str) -> Mapping[str, Sequence[Any]]:
+    """The types of each field that a line of this kind names; those of several classes may differ."""
+    classes = KINDS.get(event, ())
+    found: dict[str, list[Any]] = {each.name: [] for kind in classes for each in fields(kind)}
+    for kind in classes:
+        hints, spread = get_type_hints(kind), {each.name for each in fields(kind) if each.metadata == _SPREAD}
+        for name, types in found.items():
+            if name in hints.keys() - spread or spread:  # what has no field of its own is among what is spread
+                types.append(Any if name in spread else hints.get(name, Any))
+    return found
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value of JSON is one of a field of this type. A real number may be null: it was not finite."""
+    origin = get_origin(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, each) for each in get_args(kind))
+    if origin is collections.abc.Mapping:
+        return isinstance(value, dict) and all(_fits(each, get_args(kind)[1]) for each in value.values())
+    if origin is collections.abc.Sequence:
+        return isinstance(value, list) and all(_fits(each, get_args(kind)[0]) for each in value)
+    if kind is float and value is not None:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    if kind is float:
+        return True
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
+    return kind is Any or isinstance(value, str if kind is Path else kind)
+
+
+def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
+    """The complete lines in the first bytes of a log; one that is too long for an event is empty."""
+    within = False
+    while most > 0 and (line := file.readline(min(LONGEST, most))):
+        most -= len(line)
+        if line.endswith(b"\n"):
+            yield b"" if within else line
+        within = not line.endswith(b"\n")
 
 
 def _values_of(value: Any) -> dict[str, Any]:

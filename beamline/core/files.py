@@ -13,7 +13,8 @@ import uuid
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 from beamline.core.errors import DataError
 
@@ -43,7 +44,7 @@ def create_part(run: Path) -> Path:
 
 
 def _numbered(run: Path) -> dict[int, Path]:
-    found = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*"))}
+    found = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*")) if not leads_away(part)}
     return {int(number): part for number, part in found.items() if number.isdecimal()}
 
 
@@ -53,6 +54,8 @@ _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems 
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
+_STEP_BY_STEP = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")  # not on Windows
+_JUNCTION = 0xA0000003  # st_reparse_tag of a mount point of Windows
 SETTINGS = 2**20  # Most bytes of a text file of settings: YAML of 1 MB takes seconds to read
 
 
@@ -70,6 +73,63 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
         raise OSError(errno.EINVAL, f"{what}, and a regular file is expected", str(path))
     if found.st_size > largest:
         raise OSError(errno.EFBIG, f"It has {found.st_size} bytes, and at most {largest:.0f} are read", str(path))
+
+
+def leads_away(path: Path) -> bool:
+    """Whether a path is a link, or a junction of Windows, to another place."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return False
+    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
+
+
+def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
+    """The place of a regular file at a relative path below a folder, for a library that opens it by its name.
+
+    For what other people wrote: the folder itself may be a link, nothing below it. OSError as `require_regular`, and
+    where there is no file.
+    """
+    parts, place = PurePosixPath(name).parts, folder
+    for part in parts:
+        place /= part
+        if part == ".." or PurePosixPath(part).is_absolute() or leads_away(place):
+            raise OSError(errno.ELOOP, "It is a link, and only what lies in the folder itself is read", str(place))
+    place.stat()
+    require_regular(place, largest)
+    return place
+
+
+def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
+    """The file that `require_below` finds, open to be read. Where the system can, nobody can put a link or a pipe in
+    its place meanwhile: each folder on the way is opened in the one before.
+
+    A caller reads at most `largest` bytes, as the file may grow.
+    """
+    place = require_below(folder, name, largest)
+    if not _STEP_BY_STEP:
+        return place.open("rb")
+    *within, last = PurePosixPath(name).parts
+    at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        for part in within:
+            deeper = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=at)
+            os.close(at)
+            at = deeper
+        handle = os.open(last, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=at)
+    finally:
+        os.close(at)
+    file = os.fdopen(handle, "rb")
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "A regular file is expected", str(place))
+    return file
+
+
+def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
+    """The content of the file that `open_below` opens, of so many bytes at most."""
+    with open_below(folder, name, largest) as file:
+        return file.read(largest)
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:

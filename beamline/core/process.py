@@ -252,6 +252,6 @@ def json_object(line: str) -> dict[str, Any] | None:
     """The JSON object in a line of output; None for any other line, such as the output of a library."""
     try:
         found = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):  # RecursionError: nested deeper than Python's stack
         return None
     return found if isinstance(found, dict) else None

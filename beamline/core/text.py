@@ -32,6 +32,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
+def one_line(text: str, most: int = 200) -> str:
+    """The text of somebody else as one line of a log or a terminal, without control characters and not too long."""
+    line = printable(" ".join(text[: 4 * most].split()))
+    return line if len(line) <= most else line[: most - 3] + "..."
+
+
 def count(n: int, noun: str) -> str:
     """`1 view`, `2 views`."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
+from beamline.core.events import event_in
+from beamline.core.text import one_line
 from beamline.page.run_files import Reader, watched
 from beamline.scan.control import Asked, Verb, ask
 from beamline.scan.runs import DIED, newest
@@ -52,6 +54,7 @@ class RunValues:
     residual: float = _pv("ReconResidual", "of the views that the live volume has not learnt", math.nan)
     free: float = _pv("DiskFree", "of the disk with the scan file", math.nan, "GB")
     age: float = _pv("FrameAge", "since the last frame came into the file", math.nan, "s")
+    skipped: int = _pv("SkippedLines", "lines of the log that are no events", 0)
 
 
 class Severity(IntEnum):
@@ -94,15 +97,15 @@ class StampedValues:
         """The values after these further lines of the log."""
         values, stamps = self.values, dict(self.stamps)
         for line in lines:
-            event = json.loads(line)
+            event = event_in(line) or {}
             take = _TAKEN.get(str(event.get("event")))
             if take is not None:
-                taken = take(values, event)
-                values = replace(values, **taken)
-                severity = _severity(event)
-                for name in taken:
-                    worst = severity if name in _ALARMED else Severity.NO_ALARM
-                    stamps[name] = Stamp(float(event["time"]), worst, values.message if worst else "")
+                with suppress(KeyError):  # a field is not there
+                    at, taken, severity = float(event["time"]), take(values, event), _severity(event)
+                    values = replace(values, **taken)
+                    for name in taken:
+                        worst = severity if name in _ALARMED else Severity.NO_ALARM
+                        stamps[name] = Stamp(at, worst, values.message if worst else "")
         return replace(self, values=values, stamps=stamps)
 
     def with_file(self, seen: Mapping[str, Any], now: float) -> StampedValues:
@@ -115,7 +118,13 @@ class StampedValues:
         if state != before.state:
             stamps["state"] = Stamp(now, _OF_STATE.get(state, Severity.NO_ALARM), str(seen["next"]))
         values = replace(
-            before, stored=stored, percent=percent, state=state, free=seen["free"] / 1e9, age=seen["age_s"]
+            before,
+            stored=stored,
+            percent=percent,
+            state=state,
+            free=seen["free"] / 1e9,
+            age=seen["age_s"],
+            skipped=seen.get("skipped_lines", 0),
         )
         return replace(self, values=values, stamps=stamps)
 
@@ -187,6 +196,7 @@ _TAKEN = {
 
 
 _DEVICE, _UNDEFINED = 1, 6  # alarm_t.status of EPICS's normative types
+_LONGEST = 1000  # characters of a text
 PERIOD = 0.5  # s between two looks at the run
 _TYPES: dict[str, str] = {"str": "s", "int": "l", "float": "d"}
 
@@ -334,10 +344,10 @@ def _posted(value: Any, stamp: Stamp) -> dict[str, Any]:
     """A value with its time and alarm, in the fields of an NTScalar."""
     seconds = math.floor(stamp.time)
     return {
-        "value": value,
+        "value": one_line(value, _LONGEST) if isinstance(value, str) else value,
         "timeStamp.secondsPastEpoch": seconds,
         "timeStamp.nanoseconds": min(999_999_999, round(1e9 * (stamp.time - seconds))),
         "alarm.severity": int(stamp.severity),
         "alarm.status": _UNDEFINED if stamp.severity is Severity.INVALID else _DEVICE if stamp.severity else 0,
-        "alarm.message": stamp.message,
+        "alarm.message": one_line(stamp.message, _LONGEST),
     }

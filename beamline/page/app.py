@@ -29,6 +29,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
+from beamline.core.files import bytes_below
 from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import number_of, region_of, tile_of
@@ -42,6 +43,9 @@ ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
 _STATIC = files("beamline.page") / "static"
 _KEPT = 64  # answers kept for the next client
+_NO_VERB = "do what is no verb"
+_PLACES = 200  # requests with a token that are answered at the same time; an open page is one, and a verb takes none
+_STRANGERS = 100  # connections without a token: a browser shows its own within milliseconds
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'",
@@ -53,6 +57,32 @@ _HEADERS = {
 }
 
 
+class Strangers:
+    """Connections that have shown no token. Each is closed in time, and the oldest when there are many, so that they
+    take no place of those who have one. All calls come from the thread of the server."""
+
+    def __init__(self) -> None:
+        self._ends: dict[object, Callable[[], None]] = {}
+
+    def enter(self, client: object, end: Callable[[], None]) -> None:
+        """A new connection, and what closes it."""
+        if len(self._ends) >= _STRANGERS:
+            self.end(next(iter(self._ends)))
+        self._ends[client] = end
+
+    def leave(self, client: object) -> None:
+        """It has shown a token, or is closed."""
+        self._ends.pop(client, None)
+
+    def end(self, client: object) -> None:
+        """Close a connection, if it is still one of these."""
+        self._ends.pop(client, _nothing)()
+
+
+def _nothing() -> None:
+    """There is nothing to close."""
+
+
 @dataclass(frozen=True)
 class Access:
     """Who may do what."""
@@ -61,6 +91,7 @@ class Access:
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
     act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
     ended: Event = field(default_factory=Event)  # set when the server ends
+    strangers: Strangers = field(default_factory=Strangers)
 
 
 class Guard:
@@ -69,6 +100,7 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
         self._cookie = COOKIE + access.hosts[0].rpartition(":")[2]
+        self._answering = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -85,7 +117,8 @@ class Guard:
         if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
         elif _same(request.cookies.get(self._cookie, ""), self._access.look):
-            await self._app(scope, receive, send_with_headers)
+            self._access.strangers.leave(scope["client"])
+            await self._answer(request, scope, receive, send_with_headers)
         elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie(self._cookie, self._access.look, httponly=True, samesite="strict")
@@ -93,6 +126,17 @@ class Guard:
         else:
             text = "This page needs the token in the address that was printed at its start.\n"
             await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
+
+    async def _answer(self, request: Request, scope: Scope, receive: Receive, send: Send) -> None:
+        may_act = self._access.act is not None and _same(request.headers.get(ACT_HEADER, ""), self._access.act)
+        if self._answering >= _PLACES and not may_act:
+            await Response("Too many pages are open.\n", 503, media_type="text/plain")(scope, receive, send)
+            return
+        self._answering += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._answering -= 1
 
 
 def _same(given: str, expected: str) -> bool:
@@ -118,7 +162,7 @@ def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> l
         Route("/api/feed", server.feed),
         Route("/api/columns", server.columns),
         Route("/api/flags", server.flags),
-        Route("/api/frame/{frame:int}", server.frame),
+        Route("/api/frame/{frame:number}", server.frame),
         Route("/api/sinogram", server.sinogram),
         Route("/api/trace", server.trace),
         Route("/api/model.png", server.model),
@@ -163,7 +207,8 @@ class _Server:
     async def feed(self, request: Request) -> Response:
         """Server-sent events: each event of the run with its number as id, `state` whenever it changes, and `end`."""
         last = request.headers.get("last-event-id", request.query_params.get("last", ""))
-        return StreamingResponse(self._feed(int(last) + 1 if last.isdecimal() else 0), media_type="text/event-stream")
+        first = int(last) + 1 if last.isdecimal() and len(last) < 10 else 0
+        return StreamingResponse(self._feed(first), media_type="text/event-stream")
 
     async def _feed(self, first: int) -> AsyncIterator[str]:
         said, ended = "", False
@@ -244,18 +289,21 @@ class _Server:
         run, picture = self._reader.what.run, b""
         if run is not None:
             with suppress(OSError):
-                picture = (run / PICTURE).read_bytes()
+                picture = bytes_below(run, PICTURE)
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
     async def verb(self, request: Request) -> Response:
         """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
         folder, act = self._reader.what.folder, self._access.act
-        name, client = request.path_params["verb"], request.client.host if request.client else "?"
+        client = request.client.host if request.client else "?"
+        name = next(
+            (str(verb) for verb in Verb if verb == request.path_params["verb"]), _NO_VERB
+        )  # never what was sent
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
         if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
             self._log(f"refused: {name} from {client}, without the token for acting")
             return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
-        if folder is None or name not in [str(verb) for verb in Verb]:
+        if folder is None or name == _NO_VERB:
             return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
         self._log(f"{name}, asked for from {client}")
         asked = ask(folder, Verb(name))

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of, run_of
-from beamline.core.process import json_object
+from beamline.core.events import LARGEST_LOG, event_in
+from beamline.core.files import EVENTS, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
@@ -22,6 +24,7 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
 from beamline.storage.writer_lock import abandoned
 
+_AT_ONCE = 2**24  # bytes of a log that are read in one call
 SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
 _Result = TypeVar("_Result")
 
@@ -44,43 +47,59 @@ class Watched:
 
     @property
     def volumes(self) -> tuple[Path, ...]:
-        """Paths where a volume of the run may be."""
-        return () if self.run is None else (self.run / RECON, self.run / SNAPSHOT)
+        """Paths of the volumes that the run has."""
+        return tuple(self.run / name for name in (RECON, SNAPSHOT) if _is_there(self.run, name)) if self.run else ()
 
 
 def watched(path: Path) -> Watched:
     """The paths for a run folder, or a scan file. DataError if there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
-        if not (folder / EVENTS).is_file():
+        if not _is_there(folder, EVENTS):
             raise DataError(f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file.")
         return Watched(folder / SCAN, folder)
     if not path.is_file():
         raise DataError(f"{path} is not there.")
-    return Watched(path, path.parent if path.name == SCAN and (path.parent / EVENTS).is_file() else None)
+    of_run = path.name == SCAN and _is_there(path.parent, SCAN) and _is_there(path.parent, EVENTS)
+    return Watched(path, path.parent if of_run else None)
+
+
+def _is_there(folder: Path, name: str) -> bool:
+    with suppress(OSError):
+        return require_below(folder, name).is_file()
+    return False
 
 
 class EventLog:
     """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line comes with the
-    next call."""
+    next call; one that is no event is skipped, and counted."""
 
     def __init__(self, folder: Path | None) -> None:
-        self._path = None if folder is None else folder / EVENTS
-        self._at = 0
+        self._folder, self._at, self._within = folder, 0, False
         self.lines: list[str] = []
+        self.skipped = 0
 
     def refresh(self) -> None:
-        """Read new lines."""
-        if self._path is None or not self._path.is_file():
+        """Read new lines, of so many bytes at most."""
+        if self._folder is None or self._at > LARGEST_LOG:
             return
-        with self._path.open("rb") as file:
+        with suppress(OSError), open_below(self._folder, EVENTS) as file:
             file.seek(self._at)
-            added = file.read()
-        whole = added[: added.rfind(b"\n") + 1]
-        self._at += len(whole)
-        for line in whole.decode("utf-8", "replace").splitlines():
-            if json_object(line) is not None:
-                self.lines.append(line)
+            added = file.read(_AT_ONCE)
+            *whole, begun = added.split(b"\n")
+            if not whole and len(added) == _AT_ONCE:  # a line without end
+                self._at, self._within = self._at + len(added), True
+                return
+            self._at += len(added) - len(begun)
+            for line in whole:
+                self._add(b"" if self._within else line)
+                self._within = False
+
+    def _add(self, line: bytes) -> None:
+        if b"\r" not in (line := line.strip()) and event_in(line) is not None:  # a carriage return ends a line of SSE
+            self.lines.append(line.decode())
+        else:
+            self.skipped += 1
 
 
 class Reader:
@@ -137,11 +156,18 @@ class Reader:
             "free": shutil.disk_usage(self.what.scan.parent).free,
             "volume": None if volume is None else f"{volume.path.name} {volume.changed_ns}",
             "now": now,
+            "skipped_lines": self.events.skipped,
         }
 
     def _open(self) -> Recording:
         if self._recording is None:
-            self._recording = Recording(self.what.scan)
+            what = self.what
+            if what.folder is not None and os.path.lexists(what.scan):
+                try:
+                    require_below(what.folder, what.scan.name)
+                except OSError as error:
+                    raise DataError(f"{what.scan}: {error.strerror}. Name the scan file itself to watch it.") from error
+            self._recording = Recording(what.scan)
         return self._recording
 
     def _newest_volume(self) -> ShownVolume:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of
+from beamline.core.files import EVENTS, leads_away, parts_of
 from beamline.page.app import Access, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, Run, cells, describe, runs_in
@@ -46,7 +47,7 @@ class RunBrowser:
     def app(self, access: Access) -> Starlette:
         """The application; its pages of runs are to look alone."""
         self._access = replace(access, act=None)
-        routes = [Route("/api/runs", self.table), Mount("/run/{number:int}", self.page_of)]
+        routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
         return guarded("runs.html", routes, access)
 
     def table(self, request: Request) -> Response:
@@ -55,6 +56,7 @@ class RunBrowser:
             rows = [
                 {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(self._described(run))}
                 for run in runs_in(self._folder)
+                if not _by_a_stranger(self._folder, run)
             ]
         return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows})
 
@@ -86,6 +88,15 @@ class RunBrowser:
         if run not in self._known or self._known[run][0] != changed or not self._known[run][1].over:
             self._known[run] = changed, describe(run)
         return self._known[run][1]
+
+
+def _by_a_stranger(folder: Path, run: Path) -> bool:
+    """Whether another user made a link on the way to a run, which could lead to any run that this program can read."""
+    if not hasattr(os, "geteuid"):
+        return False
+    way = [run, *run.parents]
+    links = [place for place in way[: way.index(folder)] if leads_away(place)]
+    return any(link.lstat().st_uid not in (0, os.geteuid()) for link in links)
 
 
 def _changed(path: Path) -> int:

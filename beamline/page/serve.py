@@ -14,9 +14,12 @@ from threading import Event
 import psutil
 import uvicorn
 from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError
-from beamline.page.app import Access
+from beamline.page.app import Access, Strangers
+
+_SILENT = 5.0  # s in which a connection shows a token
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,22 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
+def _connections(strangers: Strangers) -> type[asyncio.Protocol]:
+    """The protocol of a connection, which has `_SILENT` to show a token. That of h11 reads 16 kB before a request."""
+
+    class Connection(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            strangers.enter(self.client, transport.abort)
+            self.loop.call_later(_SILENT, strangers.end, self.client)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            strangers.leave(self.client)
+            super().connection_lost(exc)
+
+    return Connection
+
+
 class PageServer:
     """A server that is ready to run, with known addresses."""
 
@@ -68,7 +87,7 @@ class PageServer:
         self._server = _Server(
             uvicorn.Config(
                 app, log_level="warning", access_log=False, lifespan="off",
-                timeout_graceful_shutdown=1, limit_concurrency=200, server_header=False,
+                timeout_graceful_shutdown=1, server_header=False, http=_connections(access.strangers),
             ),
             access.ended,
         )  # fmt: skip

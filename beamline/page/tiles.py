@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -80,6 +81,15 @@ def tile_of(values: Any, facts: dict[str, Any]) -> Response:
     padded = head.encode() + b" " * (-len(head.encode()) % 4)
     body = len(padded).to_bytes(4, "little") + padded + packed.numbers.tobytes()
     return Response(body, media_type="application/octet-stream")
+
+
+class _Number(IntegerConvertor):
+    """A whole number in a path; one of more digits is none that anything here has."""
+
+    regex = "[0-9]{1,9}"
+
+
+register_url_convertor("number", _Number())
 
 
 def number_of(request: Request, name: str) -> int:

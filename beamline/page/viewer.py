@@ -29,10 +29,10 @@ def viewer_routes(do: OnVolumes) -> list[Route]:
     server = _Viewer(do)
     return [
         Route("/api/volumes", server.facts),
-        Route("/api/slice/{which:int}/{axis:int}/{index:int}", server.cut),
-        Route("/api/difference/{axis:int}/{index:int}", server.difference),
-        Route("/api/histogram/{which:int}", server.histogram),
-        Route("/api/profile/{which:int}/{axis:int}/{index:int}", server.profile),
+        Route("/api/slice/{which:number}/{axis:number}/{index:number}", server.cut),
+        Route("/api/difference/{axis:number}/{index:number}", server.difference),
+        Route("/api/histogram/{which:number}", server.histogram),
+        Route("/api/profile/{which:number}/{axis:number}/{index:number}", server.profile),
     ]
 
 

@@ -7,7 +7,6 @@ modes, if the system has them, are checked at every use, and a replaced folder i
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 import threading
@@ -19,8 +18,8 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Sink, Warned
-from beamline.core.files import EVENTS, parts_of
+from beamline.core.events import Sink, Warned, event_in, whole_lines
+from beamline.core.files import EVENTS, open_below, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
@@ -215,11 +214,11 @@ def tell(run: Path, verb: Verb) -> State:
 def state_of(run: Path) -> State:
     """The state of the scan in this folder, by the last line on it in its log of events."""
     state = State.IDLE
-    with suppress(OSError), (run / EVENTS).open(encoding="utf-8") as lines:
-        for line in lines:
-            with suppress(ValueError):  # an incomplete line
-                if line.startswith('{"event": "state"') and "source" not in (said := json.loads(line)):
-                    state = State(said["state"])  # without those of the live reconstruction
+    with suppress(OSError), open_below(run, EVENTS) as file:
+        for line in whole_lines(file):
+            said = event_in(line) if line.startswith(b'{"event": "state"') else None
+            if said is not None and "source" not in said and said.get("state") in [*State]:
+                state = State(said["state"])  # without those of the live reconstruction
     return state
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from calendar import timegm
@@ -14,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import EVENTS, parts_of
-from beamline.core.text import printable, size
+from beamline.core.events import event_in, whole_lines
+from beamline.core.files import EVENTS, open_below, parts_of, require_below
+from beamline.core.text import one_line, size
 from beamline.scan.control import running, state_of
 from beamline.scan.run_folder import CONFIG, CONTROL, SCAN, STAMP
 from beamline.scan.states import State
@@ -23,7 +23,7 @@ from beamline.storage.interrupted import next_step
 
 DIED = "died"  # State of a run whose process has ended without a final event
 
-_HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample is at its head, the outcome at its end
+_HEAD, _TAIL = 2**20, 2**17  # bytes of a log that are read: the sample is at its head, the outcome at its end
 _ENDING = 600.0  # real s since the last line of a log, within which a complete scan may still be ending
 _OF_STATUS = {"complete": State.DONE, "stopped": State.STOPPED, "failed": State.FAILED}
 
@@ -121,13 +121,13 @@ def cells(run: Run) -> tuple[str, ...]:
         time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(run.time)), run.sample, frames + parts, run.state,
         size(run.bytes), counted(run.flags) if run.flags else "-", f"{of_series}{run.folder.name}",
     )  # fmt: skip
-    return tuple(printable(cell).replace("\n", " ").replace("\t", " ") for cell in row)
+    return tuple(map(one_line, row))
 
 
 def _is_run(run: Path) -> bool:
     try:
-        return (run / EVENTS).is_file()
-    except OSError:  # a file of another user
+        return require_below(run, EVENTS).is_file()
+    except OSError:  # none, a link, a pipe, or a file of another user
         return False
 
 
@@ -193,8 +193,8 @@ def _of_file(scan: Path) -> tuple[int | None, FlagCounts]:
 
 def _head(part: Path) -> Mapping[str, Any]:
     """The first event of a run; empty without one."""
-    with suppress(OSError), (part / EVENTS).open("rb") as file:
-        for line in file.readlines(_HEAD):
+    with suppress(OSError), open_below(part, EVENTS) as file:
+        for line in whole_lines(file, _HEAD):
             if (event := _event(line, ("run_started",))) is not None:
                 return event
     return {}
@@ -203,7 +203,7 @@ def _head(part: Path) -> Mapping[str, Any]:
 def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
     """The last event of each kind that tells the outcome of a part, from the end of its log."""
     said: dict[str, Mapping[str, Any]] = {}
-    with suppress(OSError), (part / EVENTS).open("rb") as file:
+    with suppress(OSError), open_below(part, EVENTS) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         for line in reversed(file.read(_TAIL).splitlines()):
             kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in said)
@@ -216,12 +216,7 @@ def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
 
 def _event(line: bytes, kinds: Iterable[str]) -> dict[str, Any] | None:
     """The event in a line, if it is of one of these kinds; keys have the order of `Event.to_json`."""
-    if not any(line.startswith(f'{{"event": "{kind}"'.encode()) for kind in kinds):
-        return None
-    with suppress(ValueError):  # an incomplete line
-        event = json.loads(line)
-        return event if isinstance(event, dict) else None
-    return None
+    return event_in(line) if any(line.startswith(f'{{"event": "{kind}"'.encode()) for kind in kinds) else None
 
 
 def _whole(value: object) -> int | None:

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of, run_of, whole_file
+from beamline.core.events import LARGEST_LOG, LONGEST
+from beamline.core.files import EVENTS, open_below, parts_of, run_of, whole_file
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -157,8 +158,8 @@ def may_hold_frames(part: Path) -> bool:
     with suppress(DataError), hdf5.open_hdf5(part) as file, hdf5.readable(part):
         if file[layout.COMMITTED][()]:
             return True
-    with suppress(OSError):
-        return '"event": "frame"' in part.with_name(EVENTS).read_text(encoding="utf-8", errors="replace")
+    with suppress(OSError), open_below(part.parent, EVENTS, LARGEST_LOG) as log:
+        return any(b'"event": "frame"' in line for line in iter(lambda: log.readline(LONGEST), b""))
     return True
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from beamline.core.events import KINDS, event_of
+from beamline.core.events import KINDS, LONGEST, event_in, event_of, whole_lines
+from beamline.epics.ioc import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
 
@@ -27,3 +30,65 @@ def test_a_line_of_no_kind_is_refused_with_its_values() -> None:
         event_of({"event": "at work", "pid": 7})
     with pytest.raises(ValueError, match="no kind"):
         event_of({"event": "warning"})
+
+
+DEEP = "[" * 100_000
+JUNK: tuple[Any, ...] = (
+    "x",
+    -1.5,
+    10**400,
+    True,
+    None,
+    [],
+    [[]],
+    {"a": {}},
+    "\ud800\x1b[2J\n",
+    1e300,
+    2**70,
+    "9" * 5000,
+)
+
+
+@pytest.mark.parametrize("line", LINES, ids=lambda line: json.loads(line)["event"])
+def test_an_event_of_a_log_is_its_values(line: str) -> None:
+    assert event_in(line) == event_in(line.encode()) == json.loads(line)
+
+
+@pytest.mark.parametrize("line", LINES, ids=lambda line: json.loads(line)["event"])
+def test_no_value_in_any_field_ends_who_reads_a_log(line: str) -> None:
+    values = json.loads(line)
+    for name in values:
+        for junk in JUNK:
+            StampedValues(RunValues(), 0.0).after([json.dumps({**values, name: junk})])
+        StampedValues(RunValues(), 0.0).after([json.dumps({key: values[key] for key in values if key != name})])
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"event": "frame", "time": 1.0, "n": "x"}', '{"event": "frame", "time": 1.0, "n": 1.0}',
+        '{"event": "frame", "time": 1.0, "n": true}', f'{{"event": "frame", "time": 1.0, "n": {2**63}}}',
+        '{"event": "frame", "time": 1.0, "mean": NaN}', '{"event": "frame", "time": 1.0, "mb_per_s": 1e999}',
+        f'{{"event": "frame", "time": 1.0, "mean": {"9" * 400}}}', f'{{"event": "frame", "n": {"9" * 5000}}}',
+        '{"event": "state", "time": null}', '{"event": "state", "time": "1"}', '{"event": "state", "time": 1e300}',
+        '{"event": "flag", "time": 1.0, "severity": "a", "rule": "b", "message": "c", "level": [1]}',
+        '{"event": "flag", "time": 1.0, "region": [0, "x"]}', '{"event": "run_started", "sample": {}}',
+        f'{{"event": "state", "message": {DEEP}', f'{{"event": "new", "a": {DEEP}{DEEP.replace("[", "]")}}}',
+        '{"event": ["state"]}', '{"time": 1.0}', "[1]", "", "\0" * 9, b"\xff\xfe", b'{"event": "new", "a": "\xff"}',
+        '{"event": "new", "a": "' + "x" * LONGEST + '"}',
+    ],
+    ids=range(24),
+)  # fmt: skip
+def test_a_line_that_is_no_event(line: str | bytes) -> None:
+    assert event_in(line) is None
+
+
+def test_lines_of_another_version_are_events() -> None:
+    assert event_in('{"event": "not known yet", "a": [1]}') == {"event": "not known yet", "a": [1]}
+    assert event_in('{"event": "frame", "time": 1.0, "new": "x"}') is not None
+
+
+def test_lines_without_end_are_passed_over() -> None:
+    content = b"a\n" + b"x" * (3 * LONGEST) + b"\nb\nincomplete"
+    assert [*whole_lines(io.BytesIO(content))] == [b"a\n", b"", b"b\n"]
+    assert [*whole_lines(io.BytesIO(content), LONGEST)] == [b"a\n"]
