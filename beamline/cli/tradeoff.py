@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import POSITIVE, SEED, json_option, names_in, parsed
 from beamline.cli.recipe import repeating
@@ -29,7 +30,19 @@ def listed(value: str) -> tuple[str, ...]:
 
 @click.command(
     cls=Grouped,
-    first=("methods", "quick", "max_seconds", "truth", "views", "rows", "binning", "axis", "rings", "output"),
+    first=(
+        "methods",
+        "quick",
+        "seconds",
+        "max_seconds",
+        "truth",
+        "views",
+        "rows",
+        "binning",
+        "axis",
+        "rings",
+        "output",
+    ),
 )
 @heading(DATA)
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -63,6 +76,7 @@ def listed(value: str) -> tuple[str, ...]:
     "of an emission also mlem and osem.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
+@equal_time
 @heading(RESOURCES)
 @click.option(
     "--max-seconds",
@@ -90,6 +104,7 @@ def tradeoff(
     states: str,
     methods: tuple[str, ...] | None,
     quick: bool,
+    seconds: float | None,
     max_seconds: float | None,
     seed: int,
     output: Path | None,
@@ -99,7 +114,7 @@ def tradeoff(
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
     With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
-    beside reconstructions of parts of them.
+    beside reconstructions of parts of them. With --seconds: each method once, all in the same time.
 
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
@@ -113,6 +128,8 @@ def tradeoff(
     from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
+    if seconds is not None and (volumes is not None or spectra is not None):
+        raise click.UsageError("--seconds is of methods that make one volume: leave out --time and --spectra.")
     folder = output or Path(f"{files[0].stem}_tradeoff")
     with events_shown(as_json) as sink:
         if spectra is not None:
@@ -124,6 +141,7 @@ def tradeoff(
             several=Several(volumes or 0, others, spectra, names_in(states)),
             depth="quick" if quick else "full",
             max_seconds=max_seconds,
+            seconds=seconds,
             seed=seed,
             command=repeating(click.get_current_context(), files, folder),
         )

@@ -37,6 +37,7 @@ class TradeoffOptions:
         several: how the views show several volumes.
         max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
             what is left is not begun, a running one is ended. None: no limit.
+        seconds: of each reconstruction, the same for all methods; None: settings are varied.
     """
 
     scan: ComparedScan
@@ -44,6 +45,7 @@ class TradeoffOptions:
     several: Several = field(default_factory=Several)
     depth: Depth = "quick"
     max_seconds: float | None = None
+    seconds: float | None = None
     seed: int = 0
     command: str = ""
 
@@ -64,7 +66,8 @@ def run_tradeoff(
     end = math.inf
     if options.max_seconds is not None:
         end = begin + options.max_seconds - min(_PAGES[0], _PAGES[1] * options.max_seconds)
-    found = compared(options.scan, options.methods, options.depth, options.several, Warnings(sink, clock))
+    warn = Warnings(sink, clock)
+    found = compared(options.scan, options.methods, options.depth, options.several, warn, options.seconds)
     data, trials = found.data, found.trials
     if options.max_seconds is not None:
         trials = telling_first(trials)
