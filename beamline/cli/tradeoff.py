@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -120,6 +121,7 @@ def tradeoff(
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
+    begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
     from beamline.scan.energies import scans_of
     from beamline.tradeoff.compared import Several
@@ -145,7 +147,7 @@ def tradeoff(
             seed=seed,
             command=repeating(click.get_current_context(), files, folder),
         )
-        table = run_tradeoff(options, sink, SystemClock())
+        table = run_tradeoff(options, sink, SystemClock(), begun=begun)
     if not as_json:
         click.echo(text(table))
         click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
