@@ -244,6 +244,14 @@ _ALLOW_NEGATIVE = click.option(
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
 """The options of methods for every row of a table: length and start of the work."""
+equal_time = click.option(
+    "--seconds",
+    type=POSITIVE,
+    metavar="EACH",
+    help="Compare in equal time: each reconstruction ends when so many seconds are over. Direct methods take what they "
+    "take.",
+)
+"""The time of every row of a table."""
 method_options = together(
     heading(METHOD),
     _STEPS,

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.method_options import row_options, row_settings
+from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import SEED, json_option, scan_argument
 from beamline.cli.recipe import repeating
@@ -24,7 +24,7 @@ from recon.methods import BASELINE, DEFAULT, names
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "axis", "rings", "steps", "iterations", "output"),
+    first=("methods", "truth", "views", "rows", "binning", "axis", "rings", "seconds", "steps", "iterations", "output"),
 )
 @heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
@@ -44,6 +44,7 @@ from recon.methods import BASELINE, DEFAULT, names
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
 )
 @row_options
+@equal_time
 @light_options
 @selection_options
 @heading(METHOD)
@@ -79,6 +80,7 @@ def study(
     photons_per_count: float | None,
     dose_in: str | None,
     ramp: Filter,
+    seconds: float | None,
     draws: int,
     seed: int,
     output: Path | None,
@@ -100,6 +102,9 @@ def study(
     from beamline.tradeoff.opened import ComparedScan
 
     methods = tuple(dict.fromkeys(methods))
+    lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
+    if lengths:
+        raise click.UsageError(f"--{lengths[0]} and --seconds exclude each other. Give one of them.")
     settings = row_settings(methods, values)
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_{which}")
@@ -108,6 +113,7 @@ def study(
         study=STUDIES[which],
         methods=methods,
         settings=settings,
+        seconds=seconds,
         filter=ramp,
         draws=draws,
         seed=seed,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
 import click
 
+from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import POSITIVE, SEED, json_option, names_in, parsed
 from beamline.cli.recipe import repeating
@@ -29,7 +31,19 @@ def listed(value: str) -> tuple[str, ...]:
 
 @click.command(
     cls=Grouped,
-    first=("methods", "quick", "max_seconds", "truth", "views", "rows", "binning", "axis", "rings", "output"),
+    first=(
+        "methods",
+        "quick",
+        "seconds",
+        "max_seconds",
+        "truth",
+        "views",
+        "rows",
+        "binning",
+        "axis",
+        "rings",
+        "output",
+    ),
 )
 @heading(DATA)
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -63,6 +77,7 @@ def listed(value: str) -> tuple[str, ...]:
     "of an emission also mlem and osem.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
+@equal_time
 @heading(RESOURCES)
 @click.option(
     "--max-seconds",
@@ -90,6 +105,7 @@ def tradeoff(
     states: str,
     methods: tuple[str, ...] | None,
     quick: bool,
+    seconds: float | None,
     max_seconds: float | None,
     seed: int,
     output: Path | None,
@@ -99,12 +115,13 @@ def tradeoff(
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
     With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
-    beside reconstructions of parts of them.
+    beside reconstructions of parts of them. With --seconds: each method once, all in the same time.
 
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
+    begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
     from beamline.scan.energies import scans_of
     from beamline.tradeoff.compared import Several
@@ -113,6 +130,8 @@ def tradeoff(
     from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
+    if seconds is not None and (volumes is not None or spectra is not None):
+        raise click.UsageError("--seconds is of methods that make one volume: leave out --time and --spectra.")
     folder = output or Path(f"{files[0].stem}_tradeoff")
     with events_shown(as_json) as sink:
         if spectra is not None:
@@ -124,10 +143,11 @@ def tradeoff(
             several=Several(volumes or 0, others, spectra, names_in(states)),
             depth="quick" if quick else "full",
             max_seconds=max_seconds,
+            seconds=seconds,
             seed=seed,
             command=repeating(click.get_current_context(), files, folder),
         )
-        table = run_tradeoff(options, sink, SystemClock())
+        table = run_tradeoff(options, sink, SystemClock(), begun=begun)
     if not as_json:
         click.echo(text(table))
         click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")

@@ -75,11 +75,16 @@ def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
         pictures.append((f"slices_{method}.png", picture))
     for name, picture in pictures:
         write_whole(folder / name, picture.png, replace=True)
+    timed = table.timed
     rows = [
         {
             "label": cell.row.label,
             "method": cell.method,
-            "cells": [f"{cell.cpu_seconds:.1f}", *(formatted(n, cell.figures[n]) for n in table.names)]
+            "cells": [
+                *([f"{cell.seconds:.1f}", cell.reached] if timed else []),
+                f"{cell.cpu_seconds:.1f}",
+                *(formatted(n, cell.figures[n]) for n in table.names),
+            ]
             if cell.status == "done"
             else [],
             "reason": cell.said,
@@ -91,7 +96,7 @@ def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
         title=table.study.title,
         summary=f"{table.study.question} {len(table.done)} of {len(table.cells)} rows on "
         f"{machine_line(dict(table.machine))}.",
-        columns=["CPU s", *(HEADINGS[name] for name in table.names)],
+        columns=[*(["s", "reached"] if timed else []), "CPU s", *(HEADINGS[name] for name in table.names)],
         rows=rows,
         sentences=[*table.draws, *table.notes],
         pictures=[picture for _, picture in pictures],

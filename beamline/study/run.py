@@ -23,7 +23,7 @@ from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.opened import ComparedScan, OpenedScan, opened_scan, until_stopped
-from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
+from beamline.tradeoff.trials import Outcome, Timed, Trial, in_time, seconds_left
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32
@@ -44,6 +44,7 @@ class StudyOptions:
         scan: the study chooses from its views.
         methods: names in `recon.methods`.
         settings: of these methods, by name; methods left out have their own.
+        seconds: of each row, the same for all methods; None: methods end when their work is done.
         filter: of the FBP of all views that rows are compared with.
         draws: how often random views are drawn.
     """
@@ -52,6 +53,7 @@ class StudyOptions:
     study: Study
     methods: Sequence[str]
     settings: Mapping[str, Mapping[str, Plain]] = field(default_factory=dict)
+    seconds: float | None = None
     filter: Filter = "shepp-logan"
     draws: int = 3
     seed: int = 0
@@ -120,9 +122,10 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
         write_array(work / "views.npy", scan.prepared.projections.data)
         if (rays := scan.prepared.rays_there()) is not None:
             write_array(work / "rays.npy", rays)
-        rig = Rig(work, scan.prepared.geometry, options.seed, options.settings, scan.prepared.emission)
+        prepared = scan.prepared
+        rig = Rig(work, prepared.geometry, options.seed, options.settings, prepared.emission, options.seconds)
         truth = scan.truth
-        del scan, rays  # from here on the views are in the file alone
+        del scan, prepared, rays  # from here on the views are in the file alone
         whole = StudyRow(REFERENCE, np.arange(rig.geometry.n_views)[:, None])
         reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
         if reference is None:
@@ -159,6 +162,8 @@ def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
     for method, settings in options.settings.items():
         if settings:
             notes.append(f"{method}: {', '.join(f'{name} {value}' for name, value in settings.items())}.")
+    if options.seconds is not None:
+        notes.append(f"Each row had {options.seconds:g} s; direct methods take what they take.")
     if truth:
         notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
     return StudyTable(
@@ -177,6 +182,7 @@ class Rig:
     """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry.
 
     Where rays have weights, rays.npy has them. Where the sample emits, `emission` has the counts behind the views.
+    `seconds`: of each row, as in `StudyOptions`.
     """
 
     work: Path
@@ -184,6 +190,12 @@ class Rig:
     seed: int
     settings: Mapping[str, Mapping[str, Plain]]
     emission: Emission | None = None
+    seconds: float | None = None
+
+    def trial(self, method: str, n_views: int, settings: Mapping[str, Plain] | None = None) -> Trial:
+        """A row by a method, by `settings` instead of the method's own."""
+        own = dict(self.settings.get(method, {}) if settings is None else settings)
+        return in_time(Trial("method", method, n_views, settings=own), self.seconds)
 
     def reconstructed(
         self, row: StudyRow, method: str, settings: Mapping[str, Plain] | None = None
@@ -205,20 +217,12 @@ class Rig:
         Data(data, geometry, None, None, weights, counted).save(self.work / "data.npz")
         del data
         kept = self.work / "volume.npy"
-        trial = Trial(
-            "method",
-            method,
-            row.n_views,
-            settings=dict(self.settings.get(method, {}) if settings is None else settings),
-        )
-        outcome = run_trial(trial, self.work, self.seed, keep=kept)
+        outcome = run_trial(self.trial(method, row.n_views, settings), self.work, self.seed, keep=kept)
         return (np.load(kept), outcome) if outcome.status == "done" else (None, outcome)
 
     def compile(self, methods: Sequence[str]) -> None:
         """Compile the kernels of these methods; the folder has the data of a row."""
-        compile_kernels(
-            [Trial("method", method, 2, settings=dict(self.settings.get(method, {}))) for method in methods], self.work
-        )
+        compile_kernels([self.trial(method, 2) for method in methods], self.work)
 
 
 def _each(
@@ -227,7 +231,7 @@ def _each(
     """The table after each cell, and after one that Ctrl-C interrupted."""
     timed: list[Timed] = []
     todo = [(index, cell) for index, cell in enumerate(table.cells) if cell.row.groups is not None]
-    trials = [Trial("method", cell.method, cell.row.n_views) for _, cell in todo]
+    trials = [rig.trial(cell.method, cell.row.n_views) for _, cell in todo]
     begin = now()
     for n, (index, cell) in enumerate(todo):
         eta, rate = seconds_left(timed, trials[n:]), 60 * n / max(now() - begin, 1e-9)
@@ -243,7 +247,7 @@ def _each(
             slices.add(cell.label, volume, cell.row.family, cell.method)
         cell = replace(
             cell, status=outcome.status, figures=figures, seconds=outcome.seconds, cpu_seconds=outcome.cpu_seconds,
-            message=outcome.message,
+            message=outcome.message, seconds_asked=outcome.trial.seconds_asked, reached=outcome.reached,
         )  # fmt: skip
         timed.append(Timed.of(outcome, now() - started))
         table = table.with_cell(index, cell)

@@ -39,6 +39,7 @@ class Cell:
         status: only "done" comes with figures; "not run" with a message: the row was left out.
         figures: by the names of HEADINGS.
         seconds, cpu_seconds: of the reconstruction.
+        seconds_asked, reached: as in `Trial` and `Outcome`.
     """
 
     row: StudyRow
@@ -48,6 +49,8 @@ class Cell:
     seconds: float = math.nan
     cpu_seconds: float = math.nan
     message: str = ""
+    seconds_asked: float | None = None
+    reached: str = ""
 
     @property
     def label(self) -> str:
@@ -92,6 +95,11 @@ class StudyTable:
         return len(self.done)
 
     @property
+    def timed(self) -> bool:
+        """Rows end when their time is over."""
+        return any(cell.seconds_asked is not None for cell in self.cells)
+
+    @property
     def names(self) -> list[str]:
         """Figures that any cell has."""
         return [name for name in HEADINGS if any(name in cell.figures for cell in self.cells)]
@@ -123,13 +131,17 @@ def text(table: StudyTable) -> str:
     """The table for people."""
     width = max(len(cell.row.label) for cell in table.cells) + 2
     kind = max(len(cell.method) for cell in table.cells) + 2
-    head = f"{'':<{width}}{'':<{kind}}{'CPU s':>8}" + "".join(f"{HEADINGS[name]:>12}" for name in table.names)
+    timed = table.timed
+    head = f"{'':<{width}}{'':<{kind}}" + f"{'s asked':>9}{'s':>8}" * timed + f"{'CPU s':>8}"
+    head += "".join(f"{HEADINGS[name]:>12}" for name in table.names) + "  reached" * timed
     lines = [table.study.question, machine_line(dict(table.machine)), "", head]
     for cell in table.cells:
         begin = f"{cell.row.label:<{width}}{cell.method:<{kind}}"
         if cell.status == "done":
             figures = (formatted(name, cell.figures[name]) for name in table.names)
-            lines.append(begin + f"{cell.cpu_seconds:>8.1f}" + "".join(f"{figure:>12}" for figure in figures))
+            asked = "–" if cell.seconds_asked is None else f"{cell.seconds_asked:g}"
+            times = f"{asked:>9}{cell.seconds:>8.1f}" * timed + f"{cell.cpu_seconds:>8.1f}"
+            lines.append(begin + times + "".join(f"{figure:>12}" for figure in figures) + f"  {cell.reached}" * timed)
         else:
             lines.append(begin + cell.said)
     return "\n".join(
@@ -162,7 +174,8 @@ def _record(cell: Cell, light: Light | None) -> dict[str, str | float | None]:
     return {
         "row": cell.row.label, "method": cell.method, "views": cell.row.n_views, "window": cell.row.window,
         "frames": cell.row.frames, **({} if light is None else light.of(cell.row.frames)),
-        "status": cell.status, "seconds": cell.seconds, "cpu_seconds": cell.cpu_seconds,
+        "status": cell.status, "seconds_asked": cell.seconds_asked, "seconds": cell.seconds,
+        "cpu_seconds": cell.cpu_seconds, "reached": cell.reached,
         **{name: cell.figures.get(name) for name in HEADINGS},
         "message": cell.message,
     }  # fmt: skip

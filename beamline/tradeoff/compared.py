@@ -21,7 +21,7 @@ from beamline.reconstruct.time_series import times_of
 from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.opened import ComparedScan, opened_scan
-from beamline.tradeoff.trials import Trial, plan, plan_in_time, plan_of_energies
+from beamline.tradeoff.trials import Trial, plan, plan_in_equal_time, plan_in_time, plan_of_energies
 from beamline.tradeoff.varied import Depth
 from recon.base.arrays import F32
 from recon.base.volume import Grid
@@ -67,8 +67,19 @@ class Compared:
     light: Light | None = None
 
 
-def compared(scan: ComparedScan, methods: Sequence[str], depth: Depth, several: Several, warn: Warn) -> Compared:
+def compared(
+    scan: ComparedScan,
+    methods: Sequence[str],
+    depth: Depth,
+    several: Several,
+    warn: Warn,
+    seconds: float | None = None,
+) -> Compared:
     """Read and correct the views, hold some out, and plan the trials.
+
+    Args:
+        seconds: of each reconstruction, the same for all methods; None: settings are varied, and say how long each
+            takes. Not of views that show several volumes.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -81,7 +92,8 @@ def compared(scan: ComparedScan, methods: Sequence[str], depth: Depth, several: 
     data = split(opened.prepared, opened.truth)
     n, start = data.geometry.n_views, default_count(data.geometry, opened.grid.voxel_size)
     facts = {**opened.facts, "views used": str(n)}
-    trials = plan(methods or names_compared(data.emission is not None), n, start, depth)
+    methods = methods or names_compared(data.emission is not None)
+    trials = plan(methods, n, start, depth) if seconds is None else plan_in_equal_time(methods, n, start, seconds)
     return Compared(data, trials, facts, opened.prepared.length_unit, opened.light)
 
 

@@ -61,7 +61,9 @@ def text(table: TrialTable) -> str:
     width = max((len(outcome.trial.label) for outcome in table.outcomes), default=5)
     names = _metric_names(table)
     lines.append(
-        f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}" + "".join(f"{_COLUMNS[n].short:>9}" for n in names)
+        f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}"
+        + "".join(f"{_COLUMNS[n].short:>9}" for n in names)
+        + "  reached" * table.timed
     )
     best = {table.compared[i].trial for i in table.front(TIME)}
     for outcome in table.outcomes:
@@ -70,11 +72,13 @@ def text(table: TrialTable) -> str:
         if outcome.status == "done":
             widths = (8, 8, 6, *(9 for _ in names))
             row += "".join(f"{cell:>{n}}" for cell, n in zip(_cells(outcome, names), widths, strict=True))
+            row += f"  {outcome.reached}" * table.timed
         else:
             row += f"  {outcome.status}" + (f": {outcome.message}" if outcome.message else "")
         lines.append(row)
     legend = "; ".join(f"{_COLUMNS[n].short}: {_COLUMNS[n].legend.format(table.length_unit)}" for n in names)
     notes = [*([f"{legend}."] if legend else []), "*: on the front of time and quality.", *conclusions(table)]
+    notes += [f"{o.trial.label}: {o.message}." for o in table.compared if o.message]
     return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
 
 
@@ -156,13 +160,14 @@ def to_csv(table: TrialTable) -> str:
     settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    costs = ("seconds", "cpu_seconds", "peak_bytes", "gaussians_end")
+    costs = ("seconds_asked", "seconds", "cpu_seconds", "reached", "peak_bytes", "gaussians_end")
     doses = [] if table.light is None else list(table.light.of(1))
     writer.writerow([*_FIELDS, *settings, "status", *costs, *doses, *names, "quality_db", "message"])
     for outcome in table.outcomes:
         values = [getattr(outcome.trial, name) for name in _FIELDS]
         values += [outcome.trial.settings.get(name) for name in settings]
-        values += [outcome.status, outcome.seconds, outcome.cpu_seconds, outcome.peak_bytes, outcome.gaussians]
+        values += [outcome.status, outcome.trial.seconds_asked, outcome.seconds, outcome.cpu_seconds, outcome.reached]
+        values += [outcome.peak_bytes, outcome.gaussians]
         values += [] if table.light is None else table.light.of(outcome.trial.views).values()
         values += [outcome.metrics.get(name) for name in names]
         writer.writerow([finite(v) for v in (*values, outcome.quality(table.by), outcome.message)])
@@ -218,15 +223,22 @@ def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
         summary=f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}.",
         conclusions=conclusions(table),
         pictures=pictures,
-        columns=["s", "CPU s", "MB", *(_COLUMNS[n].heading.format(table.length_unit) for n in names)],
+        columns=[
+            "s",
+            "CPU s",
+            "MB",
+            *(_COLUMNS[n].heading.format(table.length_unit) for n in names),
+            *(["reached"] if table.timed else []),
+        ],
         rows=[
             {
                 "label": outcome.trial.label,
                 "on_front": outcome.trial in on_front,
-                "cells": _cells(outcome, names),
+                "cells": [*cells, *([outcome.reached] if table.timed and cells else [])],
                 "reason": f"{outcome.status}: {outcome.message}".rstrip(": "),
             }
             for outcome in table.outcomes
+            for cells in [_cells(outcome, names)]
         ],
         scan=table.scan,
         command=table.command,

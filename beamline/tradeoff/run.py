@@ -37,6 +37,7 @@ class TradeoffOptions:
         several: how the views show several volumes.
         max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
             what is left is not begun, a running one is ended. None: no limit.
+        seconds: of each reconstruction, the same for all methods; None: settings are varied.
     """
 
     scan: ComparedScan
@@ -44,27 +45,38 @@ class TradeoffOptions:
     several: Several = field(default_factory=Several)
     depth: Depth = "quick"
     max_seconds: float | None = None
+    seconds: float | None = None
     seed: int = 0
     command: str = ""
 
 
 def run_tradeoff(
-    options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic
+    options: TradeoffOptions,
+    sink: Sink,
+    clock: Clock,
+    now: Callable[[], float] = time.monotonic,
+    begun: float | None = None,
 ) -> TrialTable:
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
     `stopped`. A folder without results is removed.
 
+    Args:
+        begun: by `now`, when the time of the run began; None: it begins here.
+
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    folder, started, begin = options.scan.folder, clock.now(), now()
+    folder, started = options.scan.folder, clock.now()
     end = math.inf
     if options.max_seconds is not None:
-        end = begin + options.max_seconds - min(_PAGES[0], _PAGES[1] * options.max_seconds)
-    found = compared(options.scan, options.methods, options.depth, options.several, Warnings(sink, clock))
+        end = (
+            (now() if begun is None else begun) + options.max_seconds - min(_PAGES[0], _PAGES[1] * options.max_seconds)
+        )
+    warn = Warnings(sink, clock)
+    found = compared(options.scan, options.methods, options.depth, options.several, warn, options.seconds)
     data, trials = found.data, found.trials
     if options.max_seconds is not None:
         trials = telling_first(trials)
@@ -111,11 +123,10 @@ def _each(
     for index, outcome in enumerate(table.outcomes):
         trial = outcome.trial
         left = None if end == math.inf else end - now()
-        if left is not None and left <= 0:
-            break
-        needed = seconds_left(timed, [trial])
-        if left is not None and needed is not None and needed > left:
+        needed = seconds_left(timed, [trial]) or 0.0
+        if left is not None and needed >= left:
             message = f"not begun: it would take about {needed:.0f} s, of which {left:.0f} s were left"
+            message = message if left > 0 else "not begun: no time was left"
             table = table.with_outcome(index, replace(outcome, message=message))
             yield table
             continue

@@ -71,6 +71,11 @@ class TrialTable:
         return sum(outcome.status == "done" for outcome in self.outcomes)
 
     @property
+    def timed(self) -> bool:
+        """Trials end when their time is over."""
+        return any(outcome.trial.seconds_asked is not None for outcome in self.outcomes)
+
+    @property
     def dose(self) -> TrialCost:
         """Each view is a frame of the scan."""
         a_frame, axis = dose_scale(self.light)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from beamline.tradeoff.varied import JOINT, MOTION, Depth, trials_of, work_of
+from beamline.tradeoff.varied import JOINT, MOTION, Depth, ended_by_time, trials_of, work_of
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name
 
@@ -30,6 +30,7 @@ class Trial:
         settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
         parts: of the views, in time or by energy, each reconstructed by itself.
+        seconds_asked: after which a reconstruction ends; None: when its work is done.
     """
 
     group: str
@@ -39,6 +40,7 @@ class Trial:
     settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     halves: bool = False
     parts: int = 1
+    seconds_asked: float | None = None
 
     def build(self) -> Method:
         """The method with the settings of the trial.
@@ -46,7 +48,8 @@ class Trial:
         Raises:
             ValueError: for a method or a setting that there is not.
         """
-        return build(by_name(self.method), self.settings)
+        method, seconds = by_name(self.method), self.seconds_asked
+        return build(method, {**self.settings, **({} if seconds is None else ended_by_time(method, seconds))})
 
     @property
     def label(self) -> str:
@@ -54,6 +57,7 @@ class Trial:
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
         parts += [f"{self.parts} parts"] if self.parts > 1 else []
+        parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
         return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
 
     @property
@@ -108,6 +112,7 @@ class Outcome:
         curve_of: which views that record is of, in words.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         left: squared residual of each view held out.
+        reached: how far it came, such as "212 steps, 8 sweeps"; empty for a direct method.
     """
 
     trial: Trial
@@ -121,6 +126,7 @@ class Outcome:
     message: str = ""
     cpu_seconds: float = math.nan
     left: Sequence[float] = ()
+    reached: str = ""
 
     def quality(self, by: str) -> float:
         """dB by "psnr", or by "residual_held_out" as -20 log10 of it; NaN where it is not known."""
@@ -165,6 +171,21 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
         rest += [replace(base, group="views", views=n) for n in counts]
         rest += others
     return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
+
+
+def in_time(trial: Trial, seconds: float | None) -> Trial:
+    """The trial, to end when its seconds are over, if any; a direct method takes what it takes."""
+    method = by_name(trial.method)
+    if seconds is None or method.traits.direct:
+        return trial
+    by_time = ended_by_time(method, seconds)
+    kept = {name: value for name, value in trial.settings.items() if name not in by_time}
+    return replace(trial, settings=kept, seconds_asked=seconds)
+
+
+def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
+    """Each method once, all with the same time."""
+    return tuple(in_time(base, seconds) for base in _baselines(methods, n_views, gaussians))
 
 
 def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
@@ -233,7 +254,7 @@ def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
     """How long the trials that are left will take, from those done; None before the first.
 
     Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
-    a method not yet seen is taken to cost what the others did on average.
+    a method not yet seen is taken to cost what the others did on average, and one with a time to take it.
     """
     if not done:
         return None
@@ -241,6 +262,9 @@ def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
     typical = sum(one.working for one in done) / len(done)
     total = 0.0
     for trial in left:
+        if trial.seconds_asked is not None:
+            total += fixed + trial.seconds_asked
+            continue
         same = [one for one in done if one.trial.method == trial.method and one.working > 0]
         amount = sum(work(one.trial) for one in same)
         total += fixed + (work(trial) * sum(one.working for one in same) / amount if amount > 0 else typical)

@@ -12,7 +12,7 @@ from typing import Literal
 
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import names
+from recon.methods import has_setting, names
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
@@ -25,6 +25,7 @@ _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
 _PUBLISHED_STEPS = {"quick": (1000,), "full": (3000, 10_000)}
 _FIELD_STEPS = {"quick": (300,), "full": (1000, 3000)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
+_ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,12 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
         depth: "quick" has fewer trials, and shorter ones.
     """
     return TRIALS.get(method, _baseline)(gaussians, depth)
+
+
+def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
+    """The settings with which so many seconds, and nothing else, end a run of the method."""
+    lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
+    return {name: value for name, value in lengths.items() if has_setting(method, name)}
 
 
 def work_of(method: Method, n_views: int, binning: int) -> float:

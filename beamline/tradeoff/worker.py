@@ -12,6 +12,7 @@ import math
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -76,14 +77,17 @@ def run(
     seen, unseen_rays = use, data.rays_held_out
     if use.weights is not None and unseen_rays is not None:
         seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
-    grid, result, judged = Grid.matching(data.geometry), None, None
+    grid, result, judged, warned = Grid.matching(data.geometry), None, None, list[warnings.WarningMessage]()
     ready(trial, data.geometry)
     reset_peak_memory()
     before, began = cpu(), now()
     if trial.parts > 1 or trial.method in JOINT:
         volume_at = _several(trial, data, grid, seed)
     else:
-        result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), seen)
+        control = ended_in_time(trial, now, _progress(say, now))
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", UserWarning)
+            result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, control, seen)
         volume_at = partial(_always, on_grid(result.volume, grid).data)
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
@@ -100,6 +104,8 @@ def run(
         "left": left,
         "curve": [] if result is None else curve_of(result),
         "curve_of": "" if judged is None else judged.views,
+        "reached": "" if result is None else reached(result),
+        "message": "; ".join(dict.fromkeys(str(one.message) for one in warned)),
     }
 
 
@@ -149,7 +155,8 @@ def _several(trial: Trial, data: Data, grid: Grid, seed: int) -> VolumeAt:
 
     def fit(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
         use = DataUse(weights)
-        return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, None, use).volume, grid).data
+        control = ended_in_time(trial)
+        return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, control, use).volume, grid).data
 
     return by_parts(trial, data, fit)
 
@@ -170,8 +177,8 @@ def half_set_resolution(
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
 
     def half(views: NDArray[np.int64]) -> F32:
-        some = geometry.select(views)
-        result = reconstruct(trial, projections[views], some, grid, None, seed, None, _of_views(use, views, some))
+        some, control = geometry.select(views), ended_in_time(trial)
+        result = reconstruct(trial, projections[views], some, grid, None, seed, control, _of_views(use, views, some))
         return on_grid(result.volume, grid).data
 
     even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
@@ -191,7 +198,7 @@ def reconstruct(
     grid: Grid,
     held_out: tuple[F32, Geometry] | None,
     seed: int,
-    on_progress: Callable[[recon.Progress], None] | None,
+    control: RunControl,
     use: DataUse,
 ) -> Reconstruction:
     """The one place that turns a trial into a call of recon.reconstruct.
@@ -209,8 +216,28 @@ def reconstruct(
     use = DataUse(weights, unseen, use.emission if trial.binning == 1 and not unseen else None)
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
     target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
-    control = RunControl(on_progress=on_progress)
     return recon.reconstruct(binned, coarse, method, grid=target, seed=seed, use=use, control=control)
+
+
+def ended_in_time(
+    trial: Trial,
+    now: Callable[[], float] = time.perf_counter,
+    on_progress: Callable[[recon.Progress], None] | None = None,
+) -> RunControl:
+    """The control of a reconstruction that begins now, and ends when the trial's seconds, if any, are over."""
+    if trial.seconds_asked is None:
+        return RunControl(on_progress=on_progress, now=now)
+    end = now() + trial.seconds_asked
+    return RunControl(should_stop=lambda: now() >= end, on_progress=on_progress, now=now)
+
+
+def reached(result: Reconstruction) -> str:
+    """Steps or iterations done, and sweeps on voxels after a fit; empty for a direct method."""
+    if not result.history:
+        return ""
+    word = "iteration" if "iterations" in result.settings else "step"
+    done = [(result.history[-1].step, word), (result.settings.get("finish", 0), "sweep")]
+    return ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in done if n or word != "sweep")
 
 
 def on_grid(volume: Volume, grid: Grid) -> Volume:

@@ -40,7 +40,8 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, Data]]:
         truth = SCAN.truth(Grid.matching(data.geometry))
         np.save(keep, truth + np.float32(ERROR) if found else truth)
         found.append((trial, data))
-        return Outcome(trial, "done", 2.0, 10**8, cpu_seconds=1.0)
+        reached = "" if trial.seconds_asked is None else "7 iterations"
+        return Outcome(trial, "done", 2.0, 10**8, cpu_seconds=1.0, reached=reached)
 
     monkeypatch.setattr(study_run, "run_trial", trial)
     monkeypatch.setattr(study_run, "compile_kernels", lambda *_: None)
@@ -96,6 +97,20 @@ def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[An
     assert settings == {"r2": {"steps": 50}, "sirt": {"iterations": 7}, "fbp": {}}
     assert "r2: steps 50." in result.stdout and "sirt: iterations 7." in result.stdout
     assert (folder / result.stdout.split()[-1]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_in_equal_time_the_table_says_what_was_asked_what_it_took_and_how_far_each_came(
+    folder: Path, seen: list[Any]
+) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "sirt", "-m", "fbp", "--seconds", "3")
+    assert result.exit_code == 0, result.output
+    assert [trial.seconds_asked for trial, _ in seen] == [None] + 2 * [3.0, None]
+    assert "Each row had 3 s" in result.stdout and "s asked" in result.stdout and "7 iterations" in result.stdout
+    rows = [row for row in _rows(folder / "many_fixed-views") if row["status"] == "done"]
+    assert [(row["seconds_asked"], row["seconds"], row["reached"]) for row in rows] == 2 * [
+        ("3.0", "2.0", "7 iterations"), ("", "2.0", "")
+    ]  # fmt: skip
 
 
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
@@ -161,6 +176,7 @@ def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: p
         (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
         (("sector", "scan.h5", "-o", "."), 5, "never overwritten"),
         (("sector", "scan.h5", "-m", "fbp", "--steps", "5"), 2, "no row is by one of these"),
+        (("sector", "scan.h5", "--seconds", "3", "--steps", "5"), 2, "exclude each other"),
         (("fixed-views", "scan.h5"), 5, "30 views are too few"),
     ],
 )

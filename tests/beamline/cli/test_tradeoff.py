@@ -125,6 +125,7 @@ def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
         (["--states", "fresh,charged"], 2, "--spectra"),
         (["--time", "3"], 2, "3 volumes of 27 views: expected"),
         (["--time", "2", "--spectra", "table.csv"], 2, "one of them"),
+        (["--time", "2", "--seconds", "5"], 2, "one volume"),
         (["--time", "2", "--truth", "volume.npz"], 2, "several"),
         (["--spectra", "table.csv", "--photons-per-count", "1"], 2, "frames"),
         (["--spectra", "missing.csv"], 5, "missing.csv"),

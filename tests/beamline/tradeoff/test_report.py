@@ -16,8 +16,7 @@ from beamline.report.html import Picture
 from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Trial, plan
-from beamline.tradeoff.varied import Depth
+from beamline.tradeoff.trials import Outcome, Trial, plan, plan_in_equal_time
 from recon.methods import names
 from tests.beamline.html_page import parsed_page
 
@@ -33,20 +32,28 @@ def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8)
     return Outcome(trial, "done", seconds, memory, {"psnr": psnr, "ssim3d": 0.5})
 
 
-@pytest.mark.parametrize("depth", ["quick", "full"])
-def test_the_table_fits_into_120_columns(depth: Depth) -> None:
+@pytest.mark.parametrize("kind", ["quick", "full", "equal"])
+def test_the_table_fits_into_120_columns(kind: str) -> None:
     """Also with four-digit numbers of views, and with everything that can be measured."""
     metrics = {"psnr": 29.12, "ssim3d": 0.7474, "residual_held_out": 0.01784, "resolution": 0.6221}
+    if kind == "equal":
+        del metrics["resolution"]  # halves are not made in equal time
+    planned = {
+        "quick": plan(names(), 1801, 200_000, "quick"),
+        "full": plan(names(), 1801, 200_000, "full"),
+        "equal": plan_in_equal_time(names(), 1801, 200_000, 3600.0),
+    }
     outcomes = tuple(
-        Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4)
-        for trial in plan(names(), 1801, 200_000, depth)
+        Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4, reached="12345 iterations")
+        for trial in planned[kind]
     )
     said = text(TrialTable(outcomes, "psnr", "mm", machine(), {}, ""))
     rows = said.split("\n\n")[1].splitlines()[1:]
     assert len(rows) == len(outcomes)
     assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
     head = next(line for line in said.splitlines() if line.startswith("  trial"))
-    assert {len(row) for row in rows} == {len(head)}
+    assert ("reached" in head) == (kind == "equal")
+    assert {len(row.replace("  12345 iterations", "  reached")) for row in rows} == {len(head)}
     assert all(" 12346 " in row and " 40000 " in row for row in rows)
 
 

@@ -268,7 +268,20 @@ def test_a_limit_of_time_bounds_reading_compiling_and_the_page(
     assert [each.method for each in done[:2]] == ["fbp", "r2"]  # each method once, the direct one first
     assert not any(each.halves for each in done)
     left_out = [outcome for outcome in table.outcomes if outcome.status == "not run" and outcome.message]
-    assert left_out and all("not begun: it would take about" in outcome.message for outcome in left_out)
+    assert left_out and any("not begun: it would take about" in outcome.message for outcome in left_out)
+    assert len(left_out) == len(table.outcomes) - table.n_done  # each that is left out says so
+
+
+def test_the_time_that_passed_before_the_run_counts(tmp_path: Path, made_up: Any) -> None:
+    limits: list[float] = []
+
+    def timed(trial: Trial, work: Path, seed: int, left: float, keep: Path | None) -> Outcome:
+        limits.append(left)
+        return _made_up(trial)
+
+    made_up(timed)
+    run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, SystemClock(), lambda: 100.0, begun=80.0)
+    assert set(limits) == {60.0 - 20.0 - 5.0}
 
 
 def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:

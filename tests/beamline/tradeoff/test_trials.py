@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.tradeoff.trials import Outcome, Timed, Trial, decibels, plan, seconds_left, work
+from beamline.tradeoff.trials import Outcome, Timed, Trial, decibels, plan, plan_in_equal_time, seconds_left, work
+from recon.base.method import BoundedMethod
 from recon.methods import by_name, names
 
 METHODS = names()
@@ -41,6 +42,22 @@ def test_one_change_at_a_time_about_each_methods_baseline(
         assert isinstance(trial.build(), by_name(trial.method))
         assert 2 <= trial.views <= n_views
         assert not trial.halves
+
+
+@given(st.floats(0.5, 1e5), st.integers(0, 5))
+def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(seconds: float, done: int) -> None:
+    trials = plan_in_equal_time(METHODS, 60, 1000, seconds)
+    assert [trial.method for trial in trials] == list(METHODS) and not any(trial.halves for trial in trials)
+    for trial in trials:
+        method = trial.build()
+        assert trial.seconds_asked == (None if method.traits.direct else seconds)
+        assert isinstance(method, BoundedMethod) == hasattr(method, "seconds")
+        for length in {"steps", "iterations"} & {f.name for f in fields(method)}:  # type: ignore[arg-type]
+            assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
+        assert not isinstance(method, BoundedMethod) or method.seconds == seconds
+    started = [Timed(trials[0], 2.0 + seconds, seconds)] * done
+    assert (seconds_left(started, [trials[0]] * 3) is None) == (not done)
+    assert not done or seconds_left(started, [trials[0]] * 3) == pytest.approx(3 * (2.0 + seconds))
 
 
 def test_full_tries_more_than_quick() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from beamline.tradeoff.worker import main, on_grid, run
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.methods import by_name, names, taking
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import data_residual
 from tests.beamline.scans import TwoCylinders
@@ -148,6 +150,24 @@ def test_iterations(data: Data, method: str) -> None:
     few, more = (run(Trial("iterations", method, 27, settings={"iterations": n}), data, 0, _silent) for n in (1, 4))
     assert more["metrics"]["residual_held_out"] < few["metrics"]["residual_held_out"]
     assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        *(name for name in names() if not by_name(name).traits.direct and name not in taking("rays")),
+        pytest.param("intratomo", marks=pytest.mark.slow),  # fields share their steps
+    ],
+)
+def test_a_trial_with_a_time_ends_when_it_is_over(data: Data, method: str) -> None:
+    """On a clock that goes on by a tenth of a second whenever it is asked."""
+    ticks = itertools.count()
+    trial = Trial("method", method, 27, seconds_asked=8.0)
+    found = run(trial, replace(data, held_out=None), 0, _silent, lambda: 0.1 * next(ticks))
+    assert 0.6 * 8 < found["seconds"] < 1.1 * 8
+    number, word = found["reached"].split(", ")[0].split()
+    assert int(number) > 1 and word == ("iterations" if method in taking("iterations") else "steps")
+    assert np.isfinite(found["metrics"]["psnr"])
 
 
 def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
