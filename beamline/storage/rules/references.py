@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import block_means, check_block, digest
-from beamline.monitor.odd_references import flats_like_views, without_odd
+from beamline.monitor.flats_with_sample import flats_like_views, mass_missing, nothing_seen
+from beamline.monitor.odd_references import without_odd
 from beamline.monitor.references import Group, JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.finding import Finding
@@ -34,11 +35,14 @@ class ReferenceGroups:
         darks, flats: rows of each group, in the order of the file. Frames of a group that are none (see
             `beamline.monitor.odd_references`) are groups of their own.
         judged: the verdict on each group, the darks first.
+        alike: views differ from good flats and from one another by less than this line integral, by noise alone; None:
+            they show something.
     """
 
     darks: tuple[Frames, ...]
     flats: tuple[Frames, ...]
     judged: tuple[JudgedGroup, ...]
+    alike: float | None = None
 
     def good(self) -> ReferenceGroups:
         """The groups without a fault; for a kind without a good group, all groups."""
@@ -86,13 +90,17 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
         )
         witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
-    if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):
-        found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
+    alike = None
+    if lit and not any(group.faults for group in found[len(dark) :]):
+        alike = nothing_seen(lit, dark, views)
+        fault = flats_like_views(lit, dark, views) or mass_missing(lit, dark, views)
+        if fault is not None:
+            found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
     found = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in found]
     judged = sorted([*found, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
     rows = [np.array(group.rows, np.int64) for group in judged]
     n = sum(group.kind is FrameKind.DARK for group in judged)
-    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged))
+    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged), alike)
 
 
 def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
@@ -121,6 +129,14 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
     if source.quantity != "counts":
         return
     groups = reference_groups(source)
+    if groups.alike is not None:
+        yield Finding(
+            "warning",
+            "bad-references",
+            f"No view looked at differs from the flats by more than noise (line integrals below {groups.alike:.2g}). "
+            "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
+            "all sides.",
+        )
     lacking = groups.lacking()
     alike: dict[tuple[FrameKind, tuple[str, ...], bool], list[int]] = {}
     for group in groups.judged:

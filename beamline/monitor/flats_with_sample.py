@@ -1,0 +1,264 @@
+"""Flats with the sample in the beam: they look like views, or leave the views without the matter that turns in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.references import (
+    BRIGHT,
+    CHANGE_SIGMAS,
+    NORMAL,
+    UNLIT,
+    WORST,
+    FaultKind,
+    Group,
+    ReferenceFault,
+    ReferenceFrame,
+)
+
+BLOCK_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
+LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
+CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
+SAME = 0.1  # noises of a place: two frames of one scene differ by more, however alike they are
+BRIGHTER = 0.5  # of the depth of the views, by which places must be brighter than in flats with the sample in
+LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
+DRIFTS = 0.02  # of the light, by which a beam may change unnoticed (as in the check `beam`): less tells nothing
+AIR = 0.1  # line integral at the edges of the field from which they are no air
+EDGE = 16  # one column in so many, at each edge, is taken for air
+EMPTY, SHALLOW = 8, 10.0  # views at least, and percent of them that may be taken for the emptiest at a place
+OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further below
+
+Places = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class OddFrame:
+    """A frame that cannot serve: its fault, the figure, the limit, and a sentence with {figures}."""
+
+    frame: ReferenceFrame
+    kind: FaultKind
+    score: float
+    limit: float
+    said: str
+
+
+def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
+    """The fault of flats that all have the sample in the beam: they look like one view, and others outshine them.
+
+    In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
+    """
+    views = lit_views(views, darks)
+    if len(views) < 3 or not flats:
+        return None
+    base = _base(darks)
+    light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
+    lit = _lit_places(light)
+    through = [_without_drift(_log(_cells(view, base), light, lit), lit) for view in views]
+    spreads = np.array([_spread(each) for each in through])
+    beyond = np.array([_beyond_noise(each) for each in through])
+    nearest, noise = int(np.argmin(spreads)), float(np.median([noise_of(each) for each in through]))
+    if not beyond[nearest] < LIKER * np.median(beyond):
+        return None
+    level = np.median(through[nearest])
+    brighter = float(np.median([np.percentile(each, WORST) - level for each in through]))
+    darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
+    if (depth := _depth_over_air(flats, darks, views)) is not None:
+        brighter = min(brighter, -float(np.median(np.percentile(depth, 100 - WORST, axis=(1, 2)))))
+    limit = max(BRIGHTER * darker, BLOCK_SIGMAS * noise)
+    same = spreads[nearest] < SAME * noise
+    if not (same or brighter > limit > 0):
+        return None
+    said = (
+        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
+        f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: "
+        "the sample was in the beam."
+    )
+    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+
+
+def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
+    """The fault of flats that hold the sample, at an angle of no view or beside its place, too.
+
+    A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
+    as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
+    differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
+    """
+    depth = _depth_over_air(flats, darks, views)
+    if depth is None:
+        return None
+    mean = depth.mean(axis=0)
+    brighter, darker = -float(np.percentile(mean, 100 - WORST)), float(mean.clip(0).sum())
+    limit = max(AIR, CHANGE_SIGMAS * noise_of(mean))
+    if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * darker:
+        said = (
+            f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
+            "matter elsewhere, though a sample only takes light: the sample was in the beam."
+        )
+        return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+    noise = noise_of(depth - depth.mean(axis=0))
+    deepest = -np.percentile(depth - depth.mean(axis=0), SHALLOW, axis=0) - OF_SHALLOW * noise
+    masses = depth.mean(axis=(1, 2))
+    least, seen = float(deepest.mean()), float(masses.mean())
+    if not np.percentile(deepest, WORST) > DRIFTS:
+        return None
+    if not LIGHTER * least - seen > CHANGE_SIGMAS * float(masses.std()):
+        return None
+    said = (
+        f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but against "
+        f"these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
+    )
+    return ReferenceFault(FaultKind.SAMPLE_IN, seen, LIGHTER * least, said)
+
+
+def nothing_seen(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
+    """Line integral below which views differ from flats and from one another, by noise alone; None: they differ."""
+    depth = _depth_over_air(flats, darks, views)
+    if depth is None:
+        return None
+    mean = depth.mean(axis=0)
+    limits = [CHANGE_SIGMAS * noise_of(part) for part in (mean, depth - mean)]
+    shows = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
+    return max(shows) if all(most < limit for most, limit in zip(shows, limits, strict=True)) else None
+
+
+def _depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> NDArray[np.float64] | None:
+    """Line integrals [view, row, col] of places, less the straight line between the edges of each row.
+
+    Only views that have air there; None where they, places or flats are too few.
+    """
+    views = lit_views(views, darks)
+    if len(views) < EMPTY or not flats:
+        return None
+    base = _base(darks)
+    light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
+    lit = _lit_places(light)
+    rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
+    cols = np.flatnonzero(lit[rows].all(axis=0))
+    if not rows.size or cols.size < EDGE:
+        return None
+    part = np.ix_(rows, cols)
+    every = np.ones(light[part].shape, np.bool_)
+    depth = np.stack([-_log(_cells(view, base)[part], light[part], every).reshape(every.shape) for view in views])
+    n = max(1, cols.size // EDGE)
+    left, right = depth[:, :, :n].mean(axis=2), depth[:, :, -n:].mean(axis=2)
+    air = np.percentile(np.abs(np.concatenate([left, right], axis=1)), WORST, axis=1) < AIR
+    if air.sum() < EMPTY:
+        return None
+    depth, left, right = depth[air], left[air], right[air]
+    along = (np.arange(cols.size) - (n - 1) / 2) / (cols.size - n)
+    return np.asarray(depth - (left[..., None] + (right - left)[..., None] * along), np.float64)
+
+
+def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
+    """Those of the views that hold more than the light of a closed shutter, or than one value."""
+    base = _base(darks)
+    light = [float(np.percentile(_cells(view, base), BRIGHT)) for view in views]
+    least = UNLIT * max(light, default=0.0)
+    return [view for view, bright in zip(views, light, strict=True) if bright > least and varies(view)]
+
+
+def varies(frame: ReferenceFrame) -> bool:
+    known = frame.blocks[np.isfinite(frame.blocks)]
+    return known.size > 0 and bool(np.ptp(known) > 0)
+
+
+def with_sample(
+    flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], views: Group, *, single: bool
+) -> list[OddFrame]:
+    """Flats that differ less from a view than from other flats.
+
+    Args:
+        single: each flat beside those of its group; else each group beside the other groups.
+    """
+    base = _base(darks)
+    seen = [_cells(view, base) for view in views]
+    light = [[_cells(flat, base) for flat in group] for group in flats]
+    means = [np.mean(group, axis=0) for group in light]
+    bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
+    found = []
+    for at, group in enumerate(flats):
+        if not bright[at] > UNLIT * max(bright):
+            continue  # without light, which is another fault
+        if single:  # of two flats each is the other one's only witness
+            own, n = light[at], len(group)
+            rest = [own[:i] + own[i + 1 :] for i in range(n)]
+            compared = [(own[i], [np.median(rest[i], axis=0)] if n > 2 else rest[i]) for i in range(n)]
+        else:
+            compared = [(means[at], means[:at] + means[at + 1 :])]
+        for i, (image, others) in enumerate(compared):
+            if not others:
+                continue
+            lit = _lit_places(np.maximum.reduce([image, *others]))
+            changes = [_log(image, other, lit) for other in others]
+            change = min(changes, key=_spread)
+            off = _beyond_noise(change)
+            if not off > 0:
+                continue
+            like = [_beyond_noise(_log(image, view, lit)) for view in seen]
+            nearest = int(np.argmin(like))
+            if like[nearest] < LIKER * off:
+                said = (
+                    f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
+                    f"line integral, and by {like[nearest]:.2g} only from the view in frame {views[nearest].row}: the "
+                    "sample was in the beam."
+                )
+                frames = [group[i]] if single else group
+                found += [OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, said) for frame in frames]
+    return found
+
+
+def _base(darks: list[list[ReferenceFrame]] | Sequence[Group]) -> Places | float:
+    frames = [_whole(frame) for group in darks for frame in group]
+    return 0.0 if not frames else np.asarray(np.mean(frames, axis=0), np.float32)
+
+
+def _whole(frame: ReferenceFrame) -> Places:
+    return frame.blocks if frame.cells is None else frame.cells
+
+
+def _cells(frame: ReferenceFrame, base: Places | float) -> Places:
+    return np.asarray(np.nan_to_num(_whole(frame) - base), np.float32)
+
+
+def _lit_places(light: Places) -> NDArray[np.bool_]:
+    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
+
+
+def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
+    """Logarithm of the one over the other where there is light; what has none counts as a thousandth."""
+    least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
+    least = max(least, 1e-30)
+    return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+
+
+def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
+    """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
+    row, col = (at / max(n, 1) for at, n in zip(np.nonzero(lit), lit.shape, strict=True))
+    terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
+    return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
+
+
+def _spread(values: Places) -> float:
+    """Standard deviation without the outermost values."""
+    if not values.size:
+        return 0.0
+    low, high = np.percentile(values, (CLIPPED, 100 - CLIPPED))
+    return float(np.clip(values, low, high).std())
+
+
+def _beyond_noise(values: Places) -> float:
+    """Their spread without the noise; 0 where it may all be noise."""
+    spread, noise = _spread(values), noise_of(values)
+    chance = 1 + CHANGE_SIGMAS * (2 / max(values.size, 1)) ** 0.5
+    return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0
+
+
+def noise_of(values: Places) -> float:
+    """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
+    change = np.diff(values, 2, axis=-1)
+    change = change[np.isfinite(change)]
+    return NORMAL * float(np.median(np.abs(change))) / 6**0.5 if change.size else 0.0
