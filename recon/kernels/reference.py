@@ -21,6 +21,9 @@ Losses follow below. Everything is plain torch, so autograd gives the gradients 
 
 from __future__ import annotations
 
+import math
+from itertools import product
+
 import torch
 from torch import Tensor
 
@@ -264,3 +267,34 @@ def total_variation(volume: Tensor) -> Tensor:
     """Mean absolute difference of neighbours over the three axes of [z, y, x] (Zha et al. 2024)."""
     steps = [volume.diff(dim=axis).abs() for axis in range(3)]
     return torch.stack([step.sum() for step in steps]).sum() / sum(step.numel() for step in steps)
+
+
+def sparse_patches(volume: Tensor, threshold: float) -> Tensor:
+    """The mean of all blocks of [a, b, c], each without cosine coefficients up to `threshold`; see `cpu.patches`."""
+    sizes = (4, 4, 4 if volume.shape[2] >= 4 else 1)
+    beyond = volume
+    for axis, size in enumerate(sizes):
+        n = volume.shape[axis]
+        at = torch.arange(1 - size, n + size - 1) % (2 * n)
+        beyond = beyond.index_select(axis, torch.minimum(at, 2 * n - 1 - at))  # mirrored at both faces
+    blocks = beyond
+    for axis, size in enumerate(sizes):
+        blocks = blocks.unfold(axis, size, 1)
+    waves = [_cosines(size).to(volume.dtype) for size in sizes]
+    found = torch.einsum("pqrabc,ia,jb,kc->pqrijk", blocks, *waves)
+    kept = found.abs() > threshold
+    kept[..., 0, 0, 0] = True
+    values = torch.einsum("pqrijk,ia,jb,kc->pqrabc", found * kept, *waves)
+    total, (p, q, r) = torch.zeros_like(beyond), values.shape[:3]
+    for a, b, c in product(*(range(size) for size in sizes)):
+        total[a : a + p, b : b + q, c : c + r] += values[..., a, b, c]
+    inner = tuple(slice(size - 1, size - 1 + n) for size, n in zip(sizes, volume.shape, strict=True))
+    return total[inner] / math.prod(sizes)
+
+
+def _cosines(size: int) -> Tensor:
+    """The orthonormal cosine transform (DCT-II) as a matrix."""
+    order, at = torch.arange(size, dtype=torch.float64)[:, None], torch.arange(size, dtype=torch.float64)
+    waves = torch.cos(math.pi / size * (at + 0.5) * order) * math.sqrt(2 / size)
+    waves[0] /= math.sqrt(2)
+    return waves

@@ -255,6 +255,17 @@ def clamp(typing_context, lanes, low, high):
 
 
 @intrinsic
+def larger(typing_context, lanes, size):
+    """The lanes whose size exceeds `size`, a float32; zero in the others."""
+
+    def code(context, builder, signature, args):
+        size = builder.call(_vector_function(builder, "fabs", 1), args[:1])
+        return builder.select(builder.fcmp_ordered(">", size, _broadcast(builder, args[1])), args[0], _constant(0.0))
+
+    return LANES(LANES, types.float32), code
+
+
+@intrinsic
 def lowest(typing_context, lanes):
     """Lane 0."""
 

@@ -1,0 +1,220 @@
+"""Patches on the CPU: every 4 x 4 x 4 block of a volume without its small cosine coefficients, averaged (numba, threaded).
+
+    D(x) = 1/64 Σ Rᵀ T⁻¹ H(T R x)        R: a block, T: its orthonormal cosine transform, H: |c| > threshold, or the mean
+
+over all blocks that overlap the volume, which is mirrored at its faces. The transform of a plane of a block serves the
+four blocks that share this plane, and their inverse transforms are added before that of the plane.
+
+A volume is [a, b, c]; blocks are 4 x 4 x 1 where it has fewer than four voxels along c. Sixteen neighbouring blocks of
+a plane [b c] are one vector. Those that run over the end of a line along c are computed, and count nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+
+from recon.kernels.cpu import lanes
+from recon.kernels.cpu.activation import F32, OPTIONS
+
+EDGE = 4
+"""Voxels of a block along an axis."""
+
+_f = np.float32
+_BEYOND = EDGE - 1  # voxels beyond a face that blocks reach
+_HALF, _LONG, _SHORT = _f(0.5), _f(math.cos(math.pi / 8) / math.sqrt(2)), _f(math.sin(math.pi / 8) / math.sqrt(2))
+_TASKS, _LEAST, _MOST = 32, 4, 32  # tasks, about; planes of one
+
+
+class PatchScratch(NamedTuple):
+    """The volume beyond its faces, and sums of blocks; see `patch_scratch`.
+
+    Attributes:
+        given, sums: [a + 6, plane], planes of (b + 6) lines and room for the last vector.
+        share: [1, plane], what a block at each place counts: 1 / 64 (1 / 16 of a flat one), or 0.
+    """
+
+    given: F32
+    sums: F32
+    share: F32
+
+
+@njit(inline="always", fastmath=True)
+def _cosines(p, base, step):
+    """Sixteen vectors' cosine coefficients along one axis, in place: rows base + 0 ... 3 step of p."""
+    a, b = lanes.load(p, base, 0), lanes.load(p, base + step, 0)
+    c, d = lanes.load(p, base + 2 * step, 0), lanes.load(p, base + 3 * step, 0)
+    outer, inner, wide, near = a + d, b + c, a - d, b - c
+    lanes.store(p, base, 0, (outer + inner) * _HALF)
+    lanes.store(p, base + step, 0, wide * _LONG + near * _SHORT)
+    lanes.store(p, base + 2 * step, 0, (outer - inner) * _HALF)
+    lanes.store(p, base + 3 * step, 0, wide * _SHORT - near * _LONG)
+
+
+@njit(inline="always", fastmath=True)
+def _values(p, base, step):
+    """The inverse of `_cosines`."""
+    a, b = lanes.load(p, base, 0) * _HALF, lanes.load(p, base + step, 0)
+    c, d = lanes.load(p, base + 2 * step, 0) * _HALF, lanes.load(p, base + 3 * step, 0)
+    outer, inner, wide, near = a + c, a - c, b * _LONG + d * _SHORT, b * _SHORT - d * _LONG
+    lanes.store(p, base, 0, outer + wide)
+    lanes.store(p, base + step, 0, inner + near)
+    lanes.store(p, base + 2 * step, 0, inner - near)
+    lanes.store(p, base + 3 * step, 0, outer - wide)
+
+
+@njit(inline="always", fastmath=True)
+def _shrink(found, sums, size, plane, threshold):
+    """The blocks whose first plane is `plane`: `found` [4 size, 16] to `sums`, both by plane modulo 4."""
+    p0, p1, p2, p3 = (plane & 3) * size, (plane + 1 & 3) * size, (plane + 2 & 3) * size, (plane + 3 & 3) * size
+    for m in range(size):
+        a, b, c, d = (
+            lanes.load(found, p0 + m, 0), lanes.load(found, p1 + m, 0),
+            lanes.load(found, p2 + m, 0), lanes.load(found, p3 + m, 0),
+        )  # fmt: skip
+        outer, inner, wide, near = a + d, b + c, a - d, b - c
+        mean = (outer + inner) * _HALF
+        if m > 0:
+            mean = lanes.larger(mean, threshold)
+        a = mean * _HALF
+        b = lanes.larger(wide * _LONG + near * _SHORT, threshold)
+        c = lanes.larger((outer - inner) * _HALF, threshold) * _HALF
+        d = lanes.larger(wide * _SHORT - near * _LONG, threshold)
+        outer, inner, wide, near = a + c, a - c, b * _LONG + d * _SHORT, b * _SHORT - d * _LONG
+        lanes.store(sums, p0 + m, 0, lanes.load(sums, p0 + m, 0) + (outer + wide))
+        lanes.store(sums, p1 + m, 0, lanes.load(sums, p1 + m, 0) + (inner + near))
+        lanes.store(sums, p2 + m, 0, lanes.load(sums, p2 + m, 0) + (inner - near))
+        lanes.store(sums, p3 + m, 0, lanes.load(sums, p3 + m, 0) + (outer - wide))
+
+
+@njit(fastmath=True, error_model="numpy", cache=True)
+def _column(given, out, share, first, end, at, line, depth, threshold, found, sums):
+    """Sixteen columns of blocks, from planes `first` to `end` of their first voxels; `at`: of the first, in a plane."""
+    size = EDGE * depth
+    counts = lanes.load(share, 0, at)
+    for m in range(EDGE * size):
+        lanes.store(sums, m, 0, lanes.zero())
+    for plane in range(first, end + 2 * _BEYOND):
+        slot = (plane & 3) * size
+        if plane < end + _BEYOND:
+            for j in range(EDGE):
+                for k in range(depth):
+                    lanes.store(found, slot + j * depth + k, 0, lanes.load(given, plane, at + j * line + k))
+            if depth > 1:
+                for j in range(EDGE):
+                    _cosines(found, slot + j * depth, 1)
+            for k in range(depth):
+                _cosines(found, slot + k, depth)
+        done = plane - _BEYOND
+        if done < first:
+            continue
+        if done < end:
+            _shrink(found, sums, size, done, threshold)
+        slot = (done & 3) * size
+        for k in range(depth):
+            _values(sums, slot + k, depth)
+        if depth > 1:
+            for j in range(EDGE):
+                _values(sums, slot + j * depth, 1)
+        # The last voxel of a block first: a voxel then sums its blocks in one order, wherever a vector begins.
+        for j in range(EDGE - 1, -1, -1):
+            for k in range(depth - 1, -1, -1):
+                to, row = at + j * line + k, slot + j * depth + k
+                lanes.store(out, done, to, lanes.load(out, done, to) + lanes.load(sums, row, 0) * counts)
+                lanes.store(sums, row, 0, lanes.zero())
+
+
+@njit(**OPTIONS)
+def _denoise(given: F32, out: F32, share: F32, blocks: int, line: int, depth: int, threshold: float, step: int) -> None:
+    planes = given.shape[0] - _BEYOND
+    tasks = -(-planes // step)
+    for odd in range(2):  # neighbouring tasks add to the same planes
+        for half in prange((tasks + 1 - odd) // 2):
+            first = (2 * half + odd) * step
+            found, sums = np.empty((EDGE * EDGE * depth, 16), np.float32), np.empty((EDGE * EDGE * depth, 16), np.float32)
+            for at in range(0, blocks, 16):
+                _column(given, out, share, first, min(first + step, planes), at, line, depth, _f(threshold), found, sums)
+
+
+@njit(inline="always")
+def _mirrored(i, n):
+    i %= 2 * n
+    return i if i < n else 2 * n - 1 - i
+
+
+@njit(**OPTIONS)
+def _pad(x: F32, beyond: int, given: F32, sums: F32) -> None:
+    na, nb, nc = x.shape
+    line = nc + 2 * beyond
+    for p in prange(na + 2 * _BEYOND):
+        sums[p] = _f(0)
+        i = _mirrored(p - _BEYOND, na)
+        for q in range(nb + 2 * _BEYOND):
+            source, target = x[i, _mirrored(q - _BEYOND, nb)], given[p, q * line : (q + 1) * line]
+            for k in range(nc):
+                target[beyond + k] = source[k]
+            for k in range(beyond):
+                target[k], target[line - 1 - k] = source[beyond - 1 - k], source[nc - beyond + k]
+
+
+@njit(**OPTIONS)
+def _inner(sums: F32, beyond: int, floor: float, out: F32) -> None:
+    na, nb, nc = out.shape
+    line, low = nc + 2 * beyond, _f(floor)
+    for i in prange(na):
+        for j in range(nb):
+            start = (j + _BEYOND) * line + beyond
+            source, target = sums[i + _BEYOND, start : start + nc], out[i, j]
+            for k in range(nc):
+                target[k] = max(source[k], low)
+
+
+def patch_scratch(shape: tuple[int, int, int]) -> PatchScratch:
+    """Scratch of `denoise` for volumes [a, b, c] of this shape; see `scratch_values`."""
+    na, nb, nc = shape
+    depth, beyond = _depth(nc)
+    line = nc + 2 * beyond
+    blocks = _whole((nb + _BEYOND) * line)
+    size = blocks + _BEYOND * line + 16
+    share = np.zeros((nb + 2 * _BEYOND, line), np.float32)
+    share[: nb + _BEYOND, : nc + beyond] = 1 / (EDGE**2 * depth)
+    every = np.zeros((1, size), np.float32)
+    every[0, : share.size] = share.ravel()
+    return PatchScratch(*(np.zeros((na + 2 * _BEYOND, size), np.float32) for _ in range(2)), every)
+
+
+def scratch_values(shape: tuple[int, int, int]) -> int:
+    """Numbers that `patch_scratch` holds."""
+    na, nb, nc = shape
+    line = nc + 2 * _depth(nc)[1]
+    return (2 * (na + 2 * _BEYOND) + 1) * (_whole((nb + _BEYOND) * line) + _BEYOND * line + 16)
+
+
+def _depth(nc: int) -> tuple[int, int]:
+    """Voxels of a block along c, and beyond the faces."""
+    return (EDGE, _BEYOND) if nc >= EDGE else (1, 0)
+
+
+def _whole(values: int) -> int:
+    return -(-values // 16) * 16
+
+
+def denoise(x: F32, threshold: float, nonnegative: bool, scratch: PatchScratch, out: F32) -> None:
+    """out = D(x), at least 0 with `nonnegative`; `out` may be `x`.
+
+    The same bits for any number of threads.
+
+    Args:
+        x: [a, b, c].
+        threshold: of coefficients, in the unit of x; white noise of deviation σ has coefficients of deviation σ.
+    """
+    na, nb, nc = x.shape
+    depth, beyond = _depth(nc)
+    line = nc + 2 * beyond
+    _pad(x, beyond, scratch.given, scratch.sums)
+    step = min(max(na // _TASKS, _LEAST), _MOST)
+    _denoise(*scratch, (nb + _BEYOND) * line, line, depth, threshold, step)
+    _inner(scratch.sums, beyond, 0.0 if nonnegative else float(np.finfo(np.float32).min), out)
