@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
-    NORMAL,
     UNLIT,
     WORST,
     FaultKind,
@@ -19,6 +18,7 @@ from beamline.monitor.references import (
     ReferenceFault,
     ReferenceFrame,
 )
+from recon.base.arrays import median_deviation
 
 BLOCK_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
 LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
@@ -43,7 +43,7 @@ class OddFrame:
     kind: FaultKind
     score: float
     limit: float
-    said: str
+    sentence: str
 
 
 def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
@@ -72,12 +72,12 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     same = spreads[nearest] < SAME * noise
     if not (same or brighter > limit > 0):
         return None
-    said = (
+    sentence = (
         f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "
         f"{brighter:.2g} of line integral (limit {limit:.2g}), though a sample only takes light: "
         "the sample was in the beam."
     )
-    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, sentence)
 
 
 def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
@@ -94,11 +94,11 @@ def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
     brighter, darker = -float(np.percentile(mean, 100 - WORST)), float(mean.clip(0).sum())
     limit = max(AIR, CHANGE_SIGMAS * noise_of(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * darker:
-        said = (
+        sentence = (
             f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
             "matter elsewhere, though a sample only takes light: the sample was in the beam."
         )
-        return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+        return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, sentence)
     noise = noise_of(depth - depth.mean(axis=0))
     deepest = -np.percentile(depth - depth.mean(axis=0), SHALLOW, axis=0) - OF_SHALLOW * noise
     masses = depth.mean(axis=(1, 2))
@@ -107,11 +107,11 @@ def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
         return None
     if not LIGHTER * least - seen > CHANGE_SIGMAS * float(masses.std()):
         return None
-    said = (
+    sentence = (
         f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but against "
         f"these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
     )
-    return ReferenceFault(FaultKind.SAMPLE_IN, seen, LIGHTER * least, said)
+    return ReferenceFault(FaultKind.SAMPLE_IN, seen, LIGHTER * least, sentence)
 
 
 def nothing_seen(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
@@ -201,13 +201,15 @@ def with_sample(
             like = [_beyond_noise(_log(image, view, lit)) for view in seen]
             nearest = int(np.argmin(like))
             if like[nearest] < LIKER * off:
-                said = (
+                sentence = (
                     f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
                     f"line integral, and by {like[nearest]:.2g} only from the view in frame {views[nearest].row}: the "
                     "sample was in the beam."
                 )
                 frames = [group[i]] if single else group
-                found += [OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, said) for frame in frames]
+                found += [
+                    OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, sentence) for frame in frames
+                ]
     return found
 
 
@@ -261,4 +263,4 @@ def noise_of(values: Places) -> float:
     """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
     change = np.diff(values, 2, axis=-1)
     change = change[np.isfinite(change)]
-    return NORMAL * float(np.median(np.abs(change))) / 6**0.5 if change.size else 0.0
+    return median_deviation(change) / 6**0.5 if change.size else 0.0

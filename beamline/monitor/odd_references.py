@@ -14,7 +14,6 @@ from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, OddFrame, Places, l
 from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
-    NORMAL,
     UNLIT,
     WORST,
     FaultKind,
@@ -25,6 +24,7 @@ from beamline.monitor.references import (
     ReferenceLimits,
 )
 from drivers.base.frame import FrameKind
+from recon.base.arrays import MEDIAN
 
 LIT = 0.02  # share of the flats' light from which a dark is lit: 0.02 of transmission, if it were the only dark
 INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
@@ -141,7 +141,7 @@ def _changed(
         levels = np.nanmedian(ratio, axis=1)
         local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
         place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
-        noise = NORMAL * float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1)))
+        noise = float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1))) / MEDIAN
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2
         flickers, changed = [], []
