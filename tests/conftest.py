@@ -36,7 +36,10 @@ os.environ["XDG_STATE_HOME"] = os.environ["LOCALAPPDATA"] = _STATE.name
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work."""
+    """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work, and
+    threads of OpenBLAS burn the time of a core while they wait."""
+    if getattr(config.option, "numprocesses", None):
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # workers, which begin later, and their processes have it
     if hasattr(config, "workerinput"):
         numba.set_num_threads(max(1, numba.get_num_threads() // config.workerinput["workercount"]))
         import torch  # here, as tests without it start in half the time

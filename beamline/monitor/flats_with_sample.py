@@ -57,7 +57,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     base = _base(darks)
     light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
     lit = _lit_places(light)
-    through = [_without_drift(_log(_cells(view, base), light, lit), lit) for view in views]
+    through = _without_drift(np.stack([_log(_cells(view, base), light, lit) for view in views]), lit)
     spreads = np.array([_spread(each) for each in through])
     beyond = np.array([_beyond_noise(each) for each in through])
     nearest, noise = int(np.argmin(spreads)), float(np.median([noise_of(each) for each in through]))
@@ -238,10 +238,12 @@ def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
 
 
 def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
-    """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
+    """Values [view, place] less a polynomial of the second order in row and column each: so a beam drifts, and a sample
+    has more detail."""
     row, col = (at / max(n, 1) for at, n in zip(np.nonzero(lit), lit.shape, strict=True))
     terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
-    return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
+    drift = np.linalg.lstsq(terms, values.T.astype(np.float64), rcond=None)[0]
+    return np.asarray(values - (terms @ drift).T, np.float32)
 
 
 def _spread(values: Places) -> float:
