@@ -53,11 +53,16 @@ class ViewLight:
             dark, flat: [row, col], of the same pixels; None: line integrals.
         """
         uniform = np.array([view.min() == view.max() for view in data], np.bool_)
-        if dark is None or flat is None:
+        if dark is None or flat is None or not len(data):
             return uniform
-        small = [_binned(image) for image in (dark, flat)]
-        bright = np.array([brightness(_binned(view), *small) for view in data])
-        return uniform | (bright < _SUSPECT * max(self.usual, 0.0))
+        views, (dark, flat) = np.stack([_binned(view) for view in data]), map(_binned, (dark, flat))
+        lit, least = _lit(flat - dark), _SUSPECT * max(self.usual, 0.0)
+        shares = (views[:, lit] - dark[lit]) / (flat - dark)[lit]
+        dim = np.ones(len(data), np.bool_)
+        if lit.any():
+            dim = ~(np.isfinite(shares).all(axis=1) & (np.median(shares, axis=1) >= least))
+        dim[dim] = [brightness(view, dark, flat) < least for view in views[dim]]  # that of the others is no less
+        return uniform | dim
 
     def unlit(self, frame: int) -> bool:
         """A whole view has no light, or is of one value where the flats are not."""
@@ -81,7 +86,7 @@ class ViewLight:
 def brightness(view: F32, dark: F32, flat: F32) -> float:
     """Share of the flats' light in a view's bright part, without what noise alone brings there; of images of cells."""
     light = flat - dark
-    lit = light > UNLIT * max(float(np.percentile(light, BRIGHT)), 0.0)
+    lit = _lit(light)
     if not lit.any():
         return 1.0
     share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
@@ -91,6 +96,10 @@ def brightness(view: F32, dark: F32, flat: F32) -> float:
     if not known.size:
         return 0.0
     return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)
+
+
+def _lit(light: F32) -> NDArray[np.bool_]:
+    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 0.0)
 
 
 def _binned(image: NDArray[np.generic]) -> F32:
