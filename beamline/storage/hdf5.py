@@ -18,7 +18,8 @@ import hdf5plugin  # noqa: F401 - registers the compressors that archived scans 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, damaged, out_of_memory
+from beamline.core.machine import memory_limit
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.journal import pending
@@ -177,7 +178,9 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except ALTERED as error:
-        if isinstance(error, MemoryError | PermissionError | FileNotFoundError):
+        # HDF5 asks for too much memory where a file is damaged, too; without a limit that is why it gets none.
+        no_memory = out_of_memory(error) and (memory_limit() is not None or not damaged(error))
+        if no_memory or isinstance(error, PermissionError | FileNotFoundError):
             raise
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
