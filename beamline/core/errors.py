@@ -82,6 +82,14 @@ def exit_code(error: BaseException) -> int:
     return BeamlineError.exit_code
 
 
+def memory_limit_said() -> str:
+    """A sentence, after a space, on the addresses that this process may take; "" without a limit."""
+    from beamline.core.machine import memory_limit  # here, because most messages need none of it
+
+    limit = memory_limit()
+    return "" if limit is None else f" This process may take {size(limit)} of addresses (ulimit -v)."
+
+
 _NO_MEMORY = re.compile(
     "failed to map segment|can't start new thread|bad_alloc|memory allocation (of|failed)|out of memory|"
     "not enough memory|(can't|cannot|could not|failed to|unable to) allocate",
@@ -118,19 +126,19 @@ def is_defect(error: BaseException) -> bool:
 def user_message(error: BaseException) -> str:
     """The message of `error` for the operator."""
     if out_of_memory(error):
-        from beamline.core.machine import memory_limit  # here, because most messages need none of it
-
-        limit, what = memory_limit(), " ".join(str(error).split()) or "no details"
-        allowed = "" if limit is None else f" This process may take {size(limit)} of addresses (ulimit -v)."
+        what = " ".join(str(error).split()) or "no details"
         return (
-            f"Out of memory ({what}).{allowed} No half result was kept, and what was there is untouched. Take fewer "
-            "--rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
+            f"Out of memory ({what}).{memory_limit_said()} No half result was kept, and what was there is untouched. "
+            "Take fewer --rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
         )
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
-        return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
+        limit = f"{said} If that is too little, the file may be good." if (said := memory_limit_said()) else ""
+        return (
+            f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original.{limit}"
+        )
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
     if is_defect(error):
