@@ -26,7 +26,7 @@ from beamline.core.errors import (
     user_message,
 )
 from beamline.core.shipped import version
-from beamline.core.text import printable
+from beamline.core.text import printable, size
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
 """Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
@@ -143,6 +143,15 @@ _COMMANDS = {
 }
 
 
+_WITH_TORCH = "demo recon materials batch tradeoff study bench voxelise render"
+_WITH_ARRAYS = "tune align scan simulate xafs view segment info validate archive monitor ingest export surface"
+_ADDRESSES = {
+    **dict.fromkeys(_WITH_TORCH.split(), 1_300_000_000),
+    **dict.fromkeys(_WITH_ARRAYS.split(), 600_000_000),
+}
+"""Bytes of addresses that the libraries of a command take at least, on Linux with two cores."""
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is used."""
 
@@ -155,6 +164,20 @@ class LazyGroup(click.Group):
             return None
         command: click.Command = getattr(import_module(f"beamline.cli.{entry.module}"), cmd_name)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does. DataError where a limit leaves no room for the libraries: some end the process then."""
+        from beamline.core.machine import memory_limit  # here, so that the help loads without it
+
+        needs = _ADDRESSES.get(args[0], 0) if args else 0
+        if needs and (limit := memory_limit()) is not None and limit < needs:
+            raise DataError(
+                f"Out of memory: this process may take {size(limit)} of addresses (ulimit -v), and the libraries of "
+                f"`beamline {args[0]}` alone take {size(needs)}. Nothing was read or written."
+            )
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -11,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from beamline.core.shipped import version
+from beamline.core.text import size
 from drivers.base.errors import DeviceError
 
 
@@ -73,11 +75,41 @@ def exit_code(error: BaseException) -> int:
         return InstrumentError.exit_code
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED
-    if isinstance(error, MemoryError) or damaged(error):
+    if out_of_memory(error) or damaged(error):
         return DataError.exit_code
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):  # one without a number is a defect
         return DataError.exit_code
     return BeamlineError.exit_code
+
+
+def memory_limit_said() -> str:
+    """A sentence, after a space, on the addresses that this process may take; "" without a limit."""
+    from beamline.core.machine import memory_limit  # here, because most messages need none of it
+
+    limit = memory_limit()
+    return "" if limit is None else f" This process may take {size(limit)} of addresses (ulimit -v)."
+
+
+_NO_MEMORY = re.compile(
+    "failed to map segment|can't start new thread|bad_alloc|memory allocation (of|failed)|out of memory|"
+    "not enough memory|(can't|cannot|could not|failed to|unable to) allocate",
+    re.IGNORECASE,
+)
+"""Sentences of the loader of libraries, Python's threads, C++, Rust, HDF5, torch (also CUDA), LLVM and numpy."""
+
+
+def out_of_memory(error: BaseException | None) -> bool:
+    """Whether memory, or the addresses that a process may take, ran out: each library has its own words for that.
+
+    An error that was raised on the way from such a one counts, too, unless it says itself what happened.
+    """
+    if error is None or isinstance(error, BeamlineError | DeviceError):
+        return False
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    if isinstance(error, OSError | RuntimeError | ImportError | SystemError) and _NO_MEMORY.search(str(error)):
+        return True
+    return out_of_memory(error.__cause__ or error.__context__)
 
 
 def damaged(error: BaseException) -> bool:
@@ -93,16 +125,20 @@ def is_defect(error: BaseException) -> bool:
 
 def user_message(error: BaseException) -> str:
     """The message of `error` for the operator."""
+    if out_of_memory(error):
+        what = " ".join(str(error).split()) or "no details"
+        return (
+            f"Out of memory ({what}).{memory_limit_said()} No half result was kept, and what was there is untouched. "
+            "Take fewer --rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
+        )
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
-    if isinstance(error, MemoryError):
-        return (
-            f"Out of memory ({str(error) or 'no details'}). No half result was kept. Take fewer --rows or --views, a "
-            "coarser --bin, or a smaller --memory, which works in slabs."
-        )
     if damaged(error):
-        return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
+        limit = f"{said} If that is too little, the file may be good." if (said := memory_limit_said()) else ""
+        return (
+            f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original.{limit}"
+        )
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
     if is_defect(error):

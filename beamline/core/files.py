@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, out_of_memory
 
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
@@ -181,6 +181,8 @@ def named_on_failure(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if out_of_memory(error):
+            raise
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
 
 
@@ -252,6 +254,8 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
         with suppress(OSError):  # the file is there in any case
             folder_to_disk(path.parent)
     except OSError as error:
+        if out_of_memory(error):
+            raise
         left = "what was there is untouched" if replace else "nothing is left of it"
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:

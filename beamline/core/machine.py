@@ -13,6 +13,9 @@ import psutil
 
 from beamline.core.text import count
 
+if sys.platform != "win32":
+    import resource
+
 _CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 # Of a control group: its line in _OWN_CGROUP, its tree, the files of its limit and of its use. In memory.stat: the file
@@ -52,8 +55,19 @@ def usable_cores() -> int:
 
 
 def free_memory() -> int:
-    """Bytes that can be had without swapping, also within a container's limit."""
-    return min([int(psutil.virtual_memory().available), *_left_in_cgroups(_CGROUPS, _OWN_CGROUP)])
+    """Bytes that can be had without swapping, also within a container's limit and that of `memory_limit`."""
+    free = [int(psutil.virtual_memory().available), *_left_in_cgroups(_CGROUPS, _OWN_CGROUP)]
+    if (limit := memory_limit()) is not None:
+        free.append(max(limit - int(psutil.Process().memory_info().vms), 0))
+    return min(free)
+
+
+def memory_limit() -> int | None:
+    """Bytes of addresses that this process may take (ulimit -v); None without a limit, and on Windows."""
+    if sys.platform == "win32":
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
 
 
 def peak_memory() -> int | None:

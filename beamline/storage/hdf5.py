@@ -17,7 +17,7 @@ import hdf5plugin  # noqa: F401 - registers the compressors that archived scans 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, damaged, memory_limit_said, out_of_memory
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.journal import pending
@@ -172,11 +172,16 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except ALTERED as error:
-        if isinstance(error, MemoryError | PermissionError | FileNotFoundError):
+        # HDF5 asks for too much memory where a file is damaged, too; without a limit that is why it gets none.
+        limit = memory_limit_said()
+        no_memory = out_of_memory(error) and (limit or not damaged(error))
+        if no_memory or isinstance(error, PermissionError | FileNotFoundError):
             raise
+        limit = f"{limit} If that is too little, the file may be good." if limit and damaged(error) else ""
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
-            f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was changed."
+            f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was "
+            f"changed.{limit}"
         ) from error
 
 

@@ -19,12 +19,13 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
+from beamline.core.files import refuse_existing, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
 from beamline.storage.journal import FileChanges
 from beamline.storage.overlay import Overlay, WholeBlocks
-from beamline.storage.parts import gaps_in, require_joined, views_in, views_planned
+from beamline.storage.parts import copy_rows, gaps_in, require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
@@ -100,7 +101,10 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         begun = journal.finish(path)
         head = _checked(path)
         if head.open_for_writing or head.missing or not _finished(path):
-            done, mended = _mended(path, head)
+            try:
+                done, mended = _mended(path, head)
+            except DataError as error:
+                return _rescued(path, head, error, say)
         else:
             done, mended = _as_it_is(path, begun), FileChanges(path, head.size, ())
         return _with_view(done, mended, say)
@@ -202,6 +206,62 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
             f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
         ) from error
     return done, overlay.changes()
+
+
+def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str], None]) -> Recovered:
+    """Write the frames that can be read into a new file in its place, which a loss of power may leave as the only way.
+
+    Some writes of the last second or two are on the disk then and others are not, and HDF5 cannot end such a file. The
+    blocks that lead to earlier frames are there. The old file stays beside the new one.
+
+    Raises:
+        DataError: `damage`, where no frame can be read; or the disk does not take the new file. Nothing is changed.
+    """
+    overlay, kept = WholeBlocks(path, length=max(head.end, head.size)), path.with_name(f"{path.name}.damaged")
+    overlay.put(0, head.closed(max(head.end, head.size)).head)
+    try:
+        with h5py.File(overlay, "r") as file:
+            require_harmless(file)
+            _require_ours(path, file)
+            committed, frames = int(file[layout.COMMITTED][()]), _rows_readable(file)
+            if not frames or not head.open_for_writing:
+                raise damage
+            say(f"{path}: to recover it takes {size(head.size)} on its disk; the damaged file stays as {kept.name}.")
+            refuse_existing(kept)
+            with whole_file(path, replace=True) as partial:
+                with hdf5.created(partial, layout.LIBVER) as made:
+                    copy_rows(file, frames, made)
+                    lost = tuple(range(frames, committed))
+                    reason = f"{DIED} Its last frames are not whole on the disk, from frame {frames} on."
+                    state_ending(made, Ending("failed", gaps_in(path, made), reason))
+                    missing, damaged, altered = _views_missing(made), _damaged(made), _altered(made, frames)
+                os.link(path, kept)
+    except hdf5.ALTERED as error:
+        raise damage from error
+    return Recovered(path, True, frames, 0, missing, lost, damaged, altered, f"The damaged file is {kept} now.")
+
+
+def _rows_readable(file: h5py.File) -> int:
+    """Number of rows from the first on whose columns and pixels can be read, up to the last that is as written."""
+    n = int(file[layout.COMMITTED][()])
+    for path in layout.GROWING:
+        n = min(n, len(file[path]))
+        while n and not _reads(file[path], slice(n)):
+            n -= 1
+    for row in range(n):
+        if not all(row < len(file[path]) and _reads(file[path], row) for path in (layout.DATA, layout.PREVIEW)):
+            n = row
+            break
+    good = np.setdiff1d(np.arange(n), altered_rows(file, 0, n))
+    return int(good[-1]) + 1 if good.size else 0
+
+
+def _reads(item: h5py.Dataset, rows: slice | int) -> bool:
+    try:
+        item[rows]
+    except hdf5.ALTERED:
+        return False
+    return True
 
 
 def _read(file: h5py.File) -> None:
