@@ -143,7 +143,7 @@ def test_what_is_not_there_is_a_sentence(page: Served) -> None:
 def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All threads that answer requests are busy with a file that does not answer."""
     write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
-    (tmp_path / "events.jsonl").touch()
+    (tmp_path / "events.jsonl").write_text('{"event": "state", "state": "finishing"}\n')  # how it answers
     free, stop = threading.Event(), StopRequest()
     monkeypatch.setattr(Recording, "facts", lambda file: {"free": free.wait(60)})
     with (
