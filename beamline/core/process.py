@@ -21,6 +21,7 @@ from beamline.core.errors import INTERRUPTED
 from beamline.core.stop import StopScope
 
 _POLL = 0.2  # real s between two questions whether the process should stop
+_FROZEN = 4.0  # real s without output or processor time, after which a process that was asked to end is killed
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
 ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
@@ -121,7 +122,7 @@ class ChildProcess:
             hurry: polled in the same way while the process ends; True kills it at once.
             seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
-            grace: real s between the request to end and the kill; 0 kills at once.
+            grace: real s between the request to end and the kill; 0 kills at once. One that is frozen has _FROZEN.
         """
         self._silent_since = time.monotonic()
         ending, deadline = Ending.EXITED, self._silent_since + seconds
@@ -165,13 +166,25 @@ class ChildProcess:
     def _end(self, grace: float, hurry: Callable[[], bool]) -> None:
         if grace > 0:
             self._process.terminate()
-            deadline = time.monotonic() + grace
-            while (left := deadline - time.monotonic()) > 0 and not hurry():
+            work, since = self._work(), time.monotonic()
+            deadline = since + grace
+            while (left := min(deadline, since + _FROZEN) - time.monotonic()) > 0 and not hurry():
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(min(_POLL, left))
                     return
+                if (now := self._work()) != work:
+                    work, since = now, time.monotonic()
         self._process.kill()
         self._process.wait()
+
+    def _work(self) -> tuple[float, float]:
+        """What grows while it works: the time of its last line, or now while it waits for a disk, and its processor
+        time in s. Neither grows in a process that is stopped (SIGSTOP), or waits for itself."""
+        with suppress(psutil.Error):
+            process = psutil.Process(self._process.pid)
+            busy, waits = process.cpu_times(), process.status() == psutil.STATUS_DISK_SLEEP
+            return time.monotonic() if waits else self._silent_since, busy.user + busy.system
+        return self._silent_since, 0.0
 
     def let_go(self) -> None:
         """Close the stdin of a tethered process, as our end would."""

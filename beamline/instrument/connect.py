@@ -113,7 +113,7 @@ def connect(
             opened.callback(monitor.close)
 
         def watch(check: Callable[[], None]) -> None:
-            for device in (devices.sample, devices.filter, devices.monochromator):
+            for device in (devices.shutter, devices.sample, devices.filter, devices.monochromator):
                 if isinstance(device, Watchable):
                     device.watch(check)
 

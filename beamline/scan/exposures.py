@@ -339,14 +339,15 @@ class Exposures:
             if after <= i or tried[after]:
                 self._arm_anew(block.n - after)
             i, angle = after, float(block.angles[after])
+            self._stop.refuse_abort()
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
-                if not self.go(angle):
+                if not (self.go(angle) and self._rest(self._settle, owed)):
                     break
-                self._clock.sleep(self._settle)
                 position = self._stage.position()
-            self._clock.sleep(triggered + period - self._clock.now())
+            if not self._rest(triggered + period - self._clock.now(), owed):
+                break
             self._camera.software_trigger()
             triggered = self._clock.now()  # after the call: the time of the exposure within it is not known
             frame = self._next_frame(patience, until_stop=False)
@@ -391,9 +392,20 @@ class Exposures:
 
     def _until_nobody_moves_it(self) -> None:
         deadline = self._clock.now() + STANDS_WITHIN
-        while self._stage.moving() and self._clock.now() < deadline:
-            self._stop.refuse_abort()
+        while self._stage.moving() and self._clock.now() < deadline and not self._stop.stopping:
             self._clock.sleep(POLL)
+
+    def _rest(self, seconds: float, owed: bool) -> bool:
+        """Let so many s pass; False where a stop cut them short, which it does not in a block that is owed."""
+        deadline = self._clock.now() + seconds
+        while seconds > SLICE:
+            self._stop.refuse_abort()
+            if self._stop.stopping and not owed:
+                return False
+            self._clock.sleep(SLICE)
+            seconds = deadline - self._clock.now()
+        self._clock.sleep(seconds)
+        return True
 
     def _arm_anew(self, n: int) -> None:
         self._camera.disarm()

@@ -49,6 +49,7 @@ class PvShutter:
     def __init__(self, pvs: ShutterPvs, clock: Clock, name: str = "shutter") -> None:
         self.name = name
         self._pvs, self._clock = pvs, clock
+        self._check: Callable[[], None] = lambda: None
         with ExitStack() as opened:
             self._opener, self._closer, self._status = (
                 _channel(url, name, pvs.timeout, opened) for url in (pvs.open_pv, pvs.close_pv, pvs.status_pv)
@@ -57,12 +58,16 @@ class PvShutter:
             self.disconnect: Callable[[], None] = opened.pop_all().close
             """The shutter stays as it is."""
 
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again while it opens; its exception ends the wait, not the move."""
+        self._check = check
+
     def open(self) -> None:
         if not self.is_open():
-            self._put(self._opener, self._pvs.open_value, True)
+            self._put(self._opener, self._pvs.open_value, True, self._check)
 
     def close(self) -> None:
-        self._put(self._closer, self._pvs.close_value, False)
+        self._put(self._closer, self._pvs.close_value, False, lambda: None)
 
     def is_open(self) -> bool:
         """What the status says. Raises DeviceTimeout, DeviceError: it does not answer, or its alarm is INVALID."""
@@ -70,11 +75,11 @@ class PvShutter:
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)
 
-    def _put(self, channel: ProcessVariable, value: float | str, wanted: bool) -> None:
+    def _put(self, channel: ProcessVariable, value: float | str, wanted: bool, check: Callable[[], None]) -> None:
         request = f"{channel.name} = {value}"
         try:
             channel.write("", value)
-            arrived = _waited(lambda: self.is_open() is wanted, self._pvs.travel, self._clock)
+            arrived = _waited(lambda: self.is_open() is wanted, self._pvs.travel, self._clock, check)
         except DeviceError as cause:
             raise cause.told_by(self.name, cause.problem, request=request, state=NOT_KNOWN) from cause
         if not arrived:

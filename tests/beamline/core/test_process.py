@@ -12,6 +12,7 @@ from typing import Any
 import psutil
 import pytest
 
+from beamline.core import process as module
 from beamline.core.process import ChildProcess, Ending, json_object
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
@@ -20,6 +21,17 @@ SLEEPS = "import time; print('begun', flush=True); time.sleep(100)"
 DELIVERS = """
 import signal, sys, time
 def deliver(*_):
+    print("delivered", flush=True)
+    sys.exit(4)
+signal.signal(signal.SIGTERM, deliver)
+print("begun", flush=True)
+time.sleep(100)
+"""
+WORKS = """
+import signal, sys, time
+def deliver(*_):
+    while time.process_time() < 1.0:
+        pass
     print("delivered", flush=True)
     sys.exit(4)
 signal.signal(signal.SIGTERM, deliver)
@@ -82,6 +94,22 @@ def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hur
     assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is Ending.STOPPED
     assert time.monotonic() - begin < 10.0
     assert child.process.code != 0
+
+
+@posix
+def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silence_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_FROZEN", 0.5)
+    frozen, begin = _Child(tmp_path, DELIVERS), time.monotonic()
+    while not frozen.begun():
+        time.sleep(0.01)
+    psutil.Process(frozen.process._process.pid).suspend()
+    assert frozen.process.wait(stop=frozen.begun, grace=100.0) is Ending.STOPPED
+    assert 0.5 <= time.monotonic() - begin < 30.0 and frozen.lines == ["begun"]
+    works = _Child(tmp_path, WORKS)
+    assert works.process.wait(stop=works.begun, grace=100.0) is Ending.STOPPED
+    assert (works.lines, works.process.code) == (["begun", "delivered"], 4)
 
 
 def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 import http.client
 import json
 import struct
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,10 +13,12 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.monitor.check import Level
 from beamline.page.recording import Recording
 from beamline.page.run_files import EventLog, watched
 from beamline.page.serve import open_port
+from beamline.scan.control import verbs_taken
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
 from tests.beamline.page.served import Served, served
@@ -136,6 +140,28 @@ def test_what_is_not_there_is_a_sentence(page: Served) -> None:
     assert (status, "not in the file" in json.loads(body)["message"]) == (404, True)
     status, _, body = page.ask("/view/api/volumes")
     assert (status, json.loads(body)["message"]) == (404, "There is no volume yet.")
+
+
+def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All threads that answer requests are busy with a file that does not answer."""
+    write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
+    (tmp_path / "events.jsonl").write_text('{"event": "state", "state": "finishing"}\n')  # how it answers
+    free, stop = threading.Event(), StopRequest()
+    monkeypatch.setattr(Recording, "facts", lambda file: {"free": free.wait(60)})
+    with (
+        served(tmp_path, control=True) as page, verbs_taken(tmp_path, stop, PauseRequest()),
+        ThreadPoolExecutor(61) as pool,
+    ):  # fmt: skip
+        others = [pool.submit(page.ask, "/api/facts") for _ in range(60)]
+        assert page.addresses.act is not None
+        pool.submit(
+            act, page, "stop", x_act_token=page.addresses.act.partition("act=")[2], origin=f"http://{page.host}"
+        )
+        deadline = time.monotonic() + 15
+        while not stop.stopping and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert stop.stopping and not any(other.done() for other in others)
+        free.set()
 
 
 def test_the_feed_tells_each_event_once_also_after_a_lost_connection(page: Served) -> None:
