@@ -15,6 +15,7 @@ from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
+from beamline.storage.structure import require_inside
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
@@ -32,15 +33,20 @@ class ScanProgress:
 class Recording:
     """A scan file of ours, opened for reading while it may still be written.
 
+    Args:
+        alone: it may draw on no file outside of its folder, since another user may have written it.
+
     Raises:
         NotReadyError: the file is just being made.
         DataError: no scan of ours.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, alone: bool = False) -> None:
         self.path = path
         self._file = hdf5.open_hdf5(path, follow=True)
         try:
+            if alone:
+                require_inside(self._file)
             with hdf5.readable(path):
                 if layout.COMMITTED not in self._file:
                     raise DataError(f"{path} is no scan of this program: `beamline ingest` makes one of it.")
@@ -72,15 +78,15 @@ class Recording:
         if n:
             hdf5.look_again(times)
         newest = float(times[n - 1]) if n else None
-        return ScanProgress(n, hdf5.text(status[()]) if finished[()] else "running", newest)
+        return ScanProgress(n, hdf5.text_of(status) if finished[()] else "running", newest)
 
     def facts(self) -> dict[str, Any]:
         """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
         pixel = hdf5.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", hdf5.LENGTH_UNITS)
         axis = hdf5.dataset(self._file, layout.AXIS_COL)
         return {
-            "sample": hdf5.text(self._file["/entry/sample/name"][()]),
-            "title": hdf5.text(self._file["/entry/title"][()]),
+            "sample": hdf5.text_at(self._file, "/entry/sample/name"),
+            "title": hdf5.text_at(self._file, "/entry/title"),
             "shape": self.shape,
             "preview_bin": self.preview_bin,
             "pixel_mm": pixel,

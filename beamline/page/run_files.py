@@ -20,8 +20,10 @@ from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
 from beamline.scan.runs import DIED
+from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
+from beamline.storage.structure import require_inside
 from beamline.storage.writer_lock import abandoned
 
 _AT_ONCE = 2**24  # bytes of a log that are read in one call
@@ -167,7 +169,7 @@ class Reader:
                     require_below(what.folder, what.scan.name)
                 except OSError as error:
                     raise DataError(f"{what.scan}: {error.strerror}. Name the scan file itself to watch it.") from error
-            self._recording = Recording(what.scan)
+            self._recording = Recording(what.scan, alone=what.folder is not None)
         return self._recording
 
     def _newest_volume(self) -> ShownVolume:
@@ -178,6 +180,8 @@ class Reader:
             before, self._volume = self._volume, None
             if before is not None:
                 before.close()
+            with hdf5.open_hdf5(file.path) as opened:
+                require_inside(opened)
             self._volume, self._volume_file = ShownVolume(file.path), file
             self._thread.submit(self._read_more)
         return self._volume

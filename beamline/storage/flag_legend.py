@@ -210,7 +210,10 @@ def write_legend(file: h5py.File) -> None:
 
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
     """The legend of a scan file. ValueError for impossible bits."""
-    columns = (file[f"{LEGEND}/{name}"][()] for name in ("name", "bit", "unit", "meaning"))
+    items = [file[f"{LEGEND}/{name}"] for name in ("name", "bit", "unit", "meaning")]
+    if any(map(hdf5.is_foreign, items)):
+        raise ValueError(f"{LEGEND} lies in another file")
+    columns = (hdf5.values_of(item) for item in items)
     legend = tuple(
         FlagBit(hdf5.text(name), int(bit), hdf5.text(unit), hdf5.text(meaning))
         for name, bit, unit, meaning in zip(*columns, strict=True)

@@ -5,7 +5,9 @@ Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; transl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import TEXT, require_below
+from beamline.core.machine import free_memory
+from beamline.storage.header import shape_of
 
 _METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
+_FACTS = (*_METADATA, ".zattrs", ".zmetadata")
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -73,7 +79,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except ImportError as error:
         raise DataError(f"{path} is a Zarr, which takes its own library: to read it, pip install zarr.") from error
     try:
-        root: Any = zarr.open(str(path), mode="r")
+        root: Any = zarr.open(store=_regular_files(path), mode="r")
         image = _image(root)
         names = [each["path"] for each in image.get("datasets", [])] if dataset is None else [dataset]
         arrays: list[Any] = [root] if hasattr(root, "chunks") else [root[name] for name in names]
@@ -88,10 +94,44 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
             f"{path} holds {finest.dtype} of shape {finest.shape}; expected real numbers [z, y, x], of one time and "
             "one channel. Copy one to a file of its own."
         )
+    coarser = [array for array in coarser if is_halved(finest.shape[-3:], array)]
+    for array in (finest, *coarser):
+        try:
+            shape_of(array.shape[-3:])
+            piece = math.prod(shape_of(array.chunks[-3:], "chunk")) * np.dtype(array.dtype).itemsize
+        except ValueError as error:
+            raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
+        if piece > free_memory():
+            raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
     if spacing is not None and not all(0 < step < np.inf for step in spacing):
         raise DataError(f"{path} states voxels of {spacing} mm; expected lengths above 0. Nothing was read.")
-    halved = tuple(ZarrScale(path, array) for array in coarser if _is_halved(finest.shape[-3:], array))
-    return ZarrScale(path, finest, halved), spacing
+    return ZarrScale(path, finest, tuple(ZarrScale(path, array) for array in coarser)), spacing
+
+
+def _regular_files(path: Path) -> Any:
+    """The files of a Zarr for its library: regular ones below its folder, behind no link."""
+    from zarr.storage import LocalStore
+
+    def look_at(key: str) -> None:
+        with suppress(FileNotFoundError, NotADirectoryError):  # a chunk of the fill value
+            require_below(path, key, TEXT if key.rpartition("/")[2] in _FACTS else math.inf)
+
+    class RegularFiles(LocalStore):
+        async def get(self, key: str, *args: Any, **options: Any) -> Any:
+            look_at(key)
+            return await super().get(key, *args, **options)
+
+        def get_sync(self, key: str, **options: Any) -> Any:
+            look_at(key)
+            return super().get_sync(key, **options)
+
+        async def get_partial_values(self, prototype: Any, key_ranges: Any) -> Any:
+            parts = [*key_ranges]
+            for key, _ in parts:
+                look_at(key)
+            return await super().get_partial_values(prototype, parts)
+
+    return RegularFiles(path, read_only=True)
 
 
 def _image(root: Any) -> Mapping[str, Any]:
@@ -113,10 +153,10 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
     return z, y, x
 
 
-def _is_halved(finest: tuple[int, ...], array: Any) -> bool:
+def is_halved(finest: tuple[int, ...], array: Any) -> bool:
     """Whether a power of two takes one shape to that of an array, along each axis, rounded either way."""
     shape = getattr(array, "shape", ())[-3:]  # a group has none
-    if len(shape) < 3 or 0 in (*shape, *finest):
+    if len(shape) < 3 or min(*shape, *finest) < 1:
         return False
     steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]
     return all(m in (n // by, -(-n // by)) for n, m, by in zip(finest, shape, steps, strict=True))

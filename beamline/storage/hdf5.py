@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import errno
+import math
 import os
 import re
 import sys
@@ -45,6 +46,9 @@ TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "
 
 
 _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
+_DEEPEST = 12  # groups within another that are looked into
+_PIECE = 2**31  # bytes of a chunk of frames
+BRIEF = 2**28  # bytes of a text, a number or a list of a scan, and of the piece of a file that must be unpacked for it
 
 
 class NotReadyError(DataError):
@@ -286,9 +290,86 @@ def attribute(item: h5py.HLObject, name: str) -> str:
 
 
 def text_at(group: h5py.Group, path: str) -> str:
-    """A dataset as text; "" if it is missing."""
+    """A dataset as text; "" if it is missing, or as `text_of`."""
     item = dataset(group, path)
-    return "" if item is None else text(item[()])
+    return "" if item is None else text_of(item)
+
+
+def text_of(item: h5py.Dataset) -> str:
+    """The first value of a dataset as text; "" where it `is_foreign`."""
+    return "" if is_foreign(item) else text(first_of(item))
+
+
+def is_foreign(item: h5py.Dataset) -> bool:
+    """Text behind a link in a file that holds no images: a scan has no business with it, and its reader shows it."""
+    if item.dtype.kind in "uifb":
+        return False
+    if item.is_virtual:
+        return file_of(item) != item.file.filename
+    number = h5py.h5o.get_info(item.file.id).fileno
+    if number not in _HOLD_IMAGES:
+        if len(_HOLD_IMAGES) > 1000:
+            _HOLD_IMAGES.clear()
+        _HOLD_IMAGES[number] = any(True for _ in images_in(item.file))
+    return not _HOLD_IMAGES[number]
+
+
+def file_of(item: h5py.Dataset) -> str:
+    """The file that holds the values of a dataset: another one behind a link, or that of the first virtual source."""
+    sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
+    return next((name for name in sources if name != "."), str(item.file.filename))
+
+
+_HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's number of it
+
+
+def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
+    """Every dataset that may be images, once, also behind links."""
+    seen, groups = set(), [(file["/"], 0)]
+    while groups:
+        group, depth = groups.pop()
+        for name in group:
+            item = resolve(group, name)
+            if item is None or (known := h5py.h5o.get_info(item.id)) is None:
+                continue
+            place = (known.fileno, known.addr)
+            if place in seen:
+                continue
+            seen.add(place)
+            if isinstance(item, h5py.Group) and depth < _DEEPEST:
+                groups.append((item, depth + 1))
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3):
+                yield item
+
+
+def first_of(item: h5py.Dataset) -> Any:
+    """The first value of a dataset, which may hold many; of an empty one nothing."""
+    _require_brief(item, item.dtype.itemsize)
+    return item[()] if item.size <= 1 else item[(0,) * item.ndim]
+
+
+def values_of(item: h5py.Dataset, most: float = BRIEF) -> Any:
+    """All values of a dataset of so many bytes at most, by default those of a number, a text or a list of a scan.
+
+    Raises:
+        DataError: it holds more.
+    """
+    _require_brief(item, (item.size or 0) * item.dtype.itemsize, most)
+    return item[()]
+
+
+def piece_of(item: h5py.Dataset) -> int:
+    """Bytes that HDF5 unpacks at once: a chunk; of a dataset without chunks, a value."""
+    return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
+
+
+def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> None:
+    """DataError where so many bytes, or the piece of the file that HDF5 unpacks for them, are too many."""
+    if (n := max(n_bytes, piece_of(item))) > most:
+        raise DataError(
+            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
+            f"{most / 1e9:.3g} GB at most. Nothing was read."
+        )
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
@@ -339,7 +420,7 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
     factor = None if item is None else units.get(attribute(item, "units").lower())
     if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
         return None
-    value = float(np.ravel(item[()])[0]) * factor
+    value = float(np.ravel(first_of(item))[0]) * factor
     return value if np.isfinite(value) else None
 
 
@@ -355,7 +436,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
     if lost := missing_links(item):
         raise DataError(f"{item.file.filename} draws its angles from {lost[0]}, which is not there or differs.")
-    return np.ravel(np.asarray(item[()], np.float64)) * factor
+    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
@@ -415,6 +496,11 @@ def require_possible(item: h5py.Dataset) -> None:
         raise DataError(
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
+        )
+    if (piece := piece_of(item)) > _PIECE:
+        raise DataError(
+            f"{item.name} in {item.file.filename} is stored in pieces of {piece / 1e9:.3g} GB, which are unpacked "
+            f"for any frame; expected {_PIECE / 1e9:.3g} GB at most. Copy it with a frame a chunk."
         )
 
 

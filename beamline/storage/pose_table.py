@@ -169,7 +169,7 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
     """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
     places = choose(file, find(file))
-    keys = np.ravel(places.image_key[()])
+    keys = np.ravel(hdf5.values_of(places.image_key))
     shown = keys == FrameKind.PROJECTION
     moved: dict[str, F64] = {}
     for axis in "xyz":
@@ -178,7 +178,7 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
             continue
         hdf5.require_real(item.dtype, f"{item.name} in {path}")
         unit = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
-        values = np.ravel(np.asarray(item[()], np.float64))
+        values = np.ravel(np.asarray(hdf5.values_of(item), np.float64))
         if unit is None or values.size not in (1, keys.size):
             raise _NoPosesError(
                 f"{path}: {item.name} has {values.size} values in the units {hdf5.attribute(item, 'units')!r}; "

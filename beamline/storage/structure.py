@@ -19,6 +19,7 @@ from beamline.core.files import require_regular
 
 MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
 CLAIMED, PACKED = 1e9, 1e5  # bytes; and how many times what is stored
+_HEAD = 4096  # bytes that tell text
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
@@ -41,14 +42,31 @@ def require_harmless(file: h5py.File) -> None:
             waiting += _looked_at(other, path)
 
 
+def require_inside(file: h5py.File) -> None:
+    """DataError where a file draws on one outside of its folder."""
+    path = Path(file.filename)
+    for other in _looked_at(file, path):
+        if path.resolve().parent not in other.resolve().parents:
+            raise DataError(
+                f"{path} draws on {other}, outside of its folder. Name the file itself to have that read, too."
+            )
+
+
+def _places(name: str, path: Path) -> Iterator[Path]:
+    """Where HDF5 looks for a file that another names: as it is named, beside that, and by its last part beside it."""
+    for place in (Path(name), path.parent / name, path.parent / Path(name).name):
+        with suppress(ValueError):  # a name that no file can have
+            if os.path.lexists(place):
+                yield place
+
+
 def _looked_at(file: h5py.File, path: Path) -> list[Path]:
     """The regular files that a file draws on; DataError where one is something else."""
     found = dict[Path, None]()
     for name in dict.fromkeys(_names(file, path)):
-        # Where HDF5 looks for a file: as it is named, beside this one, and by its last part beside this one.
-        for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-            with suppress(ValueError):  # a name that no file can have
-                if place.is_dir() or not os.path.lexists(place):
+        for place in _places(name, path):
+            with suppress(ValueError):
+                if place.is_dir():
                     continue
                 try:
                     require_regular(place)
@@ -87,6 +105,7 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                     elif info.type == h5py.h5o.TYPE_DATASET:
                         dataset = h5py.h5d.open(group, name)
                         _refuse_empty_claim(dataset, f"{path}: {name.decode('utf-8', 'replace')}")
+                        _refuse_foreign_bytes(dataset, path, name.decode("utf-8", "replace"))
                         yield from _drawn_on(dataset)
 
 
@@ -105,6 +124,34 @@ def _refuse_empty_claim(dataset: Any, what: str) -> None:
         return
     if n > PACKED * (stored := dataset.get_storage_size()):
         raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
+
+
+def _refuse_foreign_bytes(dataset: Any, path: Path, name: str) -> None:
+    """DataError for values in a file of any kind (HDF5's external storage), unless they are numbers, and that file is
+    below the folder of this one, is not hidden and is no text: so it may hold images, and it is no file of others."""
+    made = dataset.get_create_plist()
+    for i in range(made.get_external_count()):
+        other, root = os.fsdecode(made.get_external(i)[0]), path.resolve().parent
+        for place in _places(other, path):
+            within = place.resolve()
+            inside = root in within.parents and not any(part.startswith(".") for part in within.relative_to(root).parts)
+            if dataset.dtype.kind not in "uif" or not inside or _is_text(within):
+                raise DataError(
+                    f"{path} keeps the values of {name} in the file {other}. Only numbers are read from such a file, "
+                    "one that lies below the folder of the scan and is no text. Nothing was read."
+                )
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a regular file begins as text does; pixels hardly ever do."""
+    try:
+        require_regular(path)
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+        said = head.decode("utf-8") if len(head) < _HEAD else head[: head.rfind(b"\n") + 1].decode("utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
+    return bool(said) and all(c.isprintable() or c.isspace() for c in said)
 
 
 def _drawn_on(dataset: Any) -> Iterator[str]:

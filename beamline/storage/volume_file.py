@@ -19,6 +19,7 @@ from beamline.core.files import RECON
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
+from beamline.storage.header import require_npy
 
 PACKED = 1e5
 """No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
@@ -117,7 +118,7 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
     slices: NDArray[np.generic] | None = None
     for z, name in enumerate(natural_sorted(item.name for item in files)):
         try:
-            values = tifffile.imread(path / name)
+            values = _from_tiff(path / name)
         except Exception as error:  # as of other foreign files
             raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
         if slices is None:
@@ -199,10 +200,13 @@ def _checked_nifti(path: Path, header: Any) -> tuple[np.dtype[Any], int]:
 
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
+        if file.peek(1)[:1] == b"\x93":
+            require_npy(file)
         loaded = np.load(file, allow_pickle=False)
         if isinstance(loaded, np.ndarray):
             return loaded, None
         with loaded:
+            _check_size(path, sum(member.file_size for member in loaded.zip.infolist()))
             arrays = {key: loaded[key] for key in loaded.files}
     name = _only(path, {key: array.ndim for key, array in arrays.items()}) if name is None else name
     if name not in arrays:

@@ -14,7 +14,7 @@ from beamline.storage import hdf5
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.nexus_geometry import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.readers.stated import EXCHANGE, EXCHANGE_ENERGY_UNITS, EXCHANGE_LENGTH_UNITS, not_used
+from beamline.storage.readers.stated import EXCHANGE, EXCHANGE_ENERGY_UNITS, EXCHANGE_LENGTH_UNITS, not_copied, not_used
 from beamline.storage.readers.turned import TurnedFrames, dimensions
 from drivers.base.frame import FrameKind
 
@@ -23,6 +23,7 @@ _UNKNOWN = "the names are unknown; theta:y:x is taken"
 _DETECTOR = "measurement/instrument/detector"
 _ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
 _ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)  # keV and mm of a detector, of numbers without a unit
+TEXTS = {"title": "exchange/title", "sample": "measurement/sample/name"}
 PLACES = (
     (FrameKind.DARK, "/exchange/data_dark"),
     (FrameKind.FLAT, "/exchange/data_white"),
@@ -50,7 +51,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
-        source.stated = not_used(EXCHANGE, file, source)
+        source.stated = not_copied(file, TEXTS.values()) + not_used(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
             source.stated += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
@@ -111,7 +112,7 @@ def _measured(
     value, item = _positive(file, where, units), hdf5.dataset(file, where)
     if value is None or item is None or hdf5.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    said = f"{np.ravel(item[()])[0]:.6g}"
+    said = f"{np.ravel(hdf5.first_of(item))[0]:.6g}"
     source.stated += (NotUsed(where, said, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 
@@ -145,10 +146,9 @@ def _attributes(file: h5py.File) -> dict[str, str | float | int]:
             said[name] = float(value)
         else:
             said[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
-    for name, where in (("title", "exchange/title"), ("sample", "measurement/sample/name")):
-        item = hdf5.dataset(file, where)
-        if item is not None:
-            said[name] = hdf5.text(item[()])
+    for name, where in TEXTS.items():
+        if hdf5.dataset(file, where) is not None:
+            said[name] = hdf5.text_at(file, where)
     said["theta_units"] = hdf5.attribute(file["exchange"].get("theta", file), "units") or "not given"
     return said
 

@@ -172,8 +172,7 @@ def _flag(detector: h5py.Group, name: str) -> bool:
     item = hdf5.dataset(detector, name)
     if item is None or item.size != 1:
         return False
-    value = np.ravel(item[()])[0]
-    return hdf5.text(value).strip().lower() in ("1", "1.0", "true", "yes")
+    return hdf5.text_of(item).strip().lower() in ("1", "1.0", "true", "yes")
 
 
 def _direction(item: h5py.Dataset) -> int | None:

@@ -34,7 +34,7 @@ from beamline.storage.readers.base import (
 )
 from beamline.storage.readers.nexus_geometry import differing, read_energy, read_geometry, require_order
 from beamline.storage.readers.nexus_places import choose, find
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_used
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_copied, not_used
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, Ending, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
@@ -134,7 +134,7 @@ class NXtomoSource(ScanSource):
         else:
             n = int(places.data.shape[0])
         angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
-        keys = np.ravel(key[()])
+        keys = np.ravel(hdf5.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
         if min(sizes) < n or (not self._ours and max(sizes) > n):
             raise DataError(
@@ -202,9 +202,10 @@ class NXtomoSource(ScanSource):
             return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
     def _find_not_used(self) -> tuple[NotUsed, ...]:
+        outside = not_copied(self._places.entry, TEXTS.values())
         if self._geometry is None:
-            return ()
-        found = not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+            return outside
+        found = outside + not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         turned = self._geometry.turned
         return (*found, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else found
 
@@ -223,7 +224,7 @@ class NXtomoSource(ScanSource):
         if item is None or item.dtype.kind not in "uif" or item.size < self.n:
             return None
         with hdf5.readable(self.path):
-            values = np.ravel(item[()])[: self.n].astype(np.float64)
+            values = np.ravel(hdf5.values_of(item))[: self.n].astype(np.float64)
         return np.where(values > 0, values, np.nan)
 
     @property
@@ -251,7 +252,7 @@ class NXtomoSource(ScanSource):
     def part_starts(self) -> NDArray[np.int64]:
         with hdf5.readable(self.path):
             item = hdf5.dataset(self._file, layout.PART_STARTS) if self._ours else None
-            starts = np.zeros(1, np.int64) if item is None else np.ravel(item[()])
+            starts = np.zeros(1, np.int64) if item is None else np.ravel(hdf5.values_of(item))
         if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
             raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
         return starts.astype(np.int64)
@@ -348,7 +349,7 @@ class NXtomoSource(ScanSource):
             return default
         if self._ours:
             hdf5.look_again(item)
-        values = np.asarray(item[()])
+        values = np.asarray(hdf5.values_of(item))
         return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
@@ -358,7 +359,7 @@ class NXtomoSource(ScanSource):
             return np.full(self.n, np.nan)
         if self._ours:
             hdf5.look_again(item)
-        values = np.ravel(item[()]).astype(np.float64) * factor
+        values = np.ravel(hdf5.values_of(item)).astype(np.float64) * factor
         if values.size == 1:
             return np.full(self.n, values[0])
         return values[: self.n] if values.size >= self.n else np.full(self.n, np.nan)

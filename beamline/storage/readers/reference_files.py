@@ -27,7 +27,6 @@ Images = Path | str | NDArray[Any]
 """A TIFF, a folder of TIFFs, an HDF5 file (`FILE::DATASET` where it has several), or an array [frame, row, col]."""
 
 _EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
-_DEEPEST = 12  # groups within another that are looked into
 _LISTED = 8  # datasets that an error names
 
 
@@ -76,7 +75,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if dataset:
         return _read(path, dataset_at(file, dataset))
     for places in find(file):
-        keys = np.ravel(places.image_key[()])
+        keys = np.ravel(hdf5.values_of(places.image_key))
         if (keys == kind).any():
             return _of_scan(NXtomoSource(path, own_angles=False, data=str(places.data.name)), kind)
     exchange = hdf5.dataset(file, _EXCHANGE[kind])
@@ -104,25 +103,7 @@ def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
     """Every dataset that may be images, once, also behind links."""
-    seen, groups = set(), [(file["/"], 0)]
-    while groups:
-        group, depth = groups.pop()
-        for name in group:
-            item = hdf5.resolve(group, name)
-            if item is None or (known := h5py.h5o.get_info(item.id)) is None:
-                continue
-            place = (known.fileno, known.addr)
-            if place in seen:
-                continue
-            seen.add(place)
-            if isinstance(item, h5py.Group) and depth < _DEEPEST:
-                groups.append((item, depth + 1))
-            elif isinstance(item, h5py.Dataset) and _may_be_images(item):
-                yield item
-
-
-def _may_be_images(item: h5py.Dataset) -> bool:
-    return item.dtype.kind in "uif" and bool(item.shape) and item.ndim in (2, 3) and min(item.shape[-2:]) > 1
+    return (item for item in hdf5.images_in(file) if min(item.shape[-2:]) > 1)
 
 
 def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) -> NDArray[Any]:

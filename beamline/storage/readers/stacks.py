@@ -133,7 +133,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         if factor is None:
             found = f"the units {said!r}" if said else "no attribute `units`"
             raise DataError(f"{where} in {path} has {found}: say --angles-unit deg or --angles-unit rad.")
-        return np.ravel(np.asarray(item[()], np.float64)) * factor
+        return np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:

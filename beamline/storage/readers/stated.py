@@ -6,7 +6,7 @@ and that nobody uses; `info` shows them, and `validate` warns where such a value
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,9 +59,12 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
     found = []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
-        if item is None or item.size == 0:
+        if item is None or item.size == 0 or hdf5.is_foreign(item):
             continue
-        value, unit = np.asarray(item[()]), hdf5.attribute(item, "units")
+        if item.size * item.dtype.itemsize > hdf5.BRIEF:  # no place, time or number of each frame
+            found.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
+            continue
+        value, unit = np.asarray(hdf5.values_of(item)), hdf5.attribute(item, "units")
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
             found.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
@@ -69,6 +72,16 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
             found.append(NotUsed(field.where, _text(value, unit), why, True))
     return tuple(found)
+
+
+def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
+    """The texts that lie in another file, which holds no images."""
+    items = [(where, hdf5.dataset(root, where)) for where in texts]
+    return tuple(
+        NotUsed(where, f"in the file {hdf5.file_of(item)}", "that holds no images, and its text is not a scan's", True)
+        for where, item in items
+        if item is not None and hdf5.is_foreign(item)
+    )
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:

@@ -62,7 +62,7 @@ def key_codes(places: Places) -> Iterator[Finding]:
     """Image keys are 0 projection, 1 flat, 2 dark, 3 invalid; -1 (alignment) only in image_key_control."""
     for name, legal in (("image_key", {0, 1, 2, 3}), ("image_key_control", {-1, 0, 1, 2, 3})):
         key = hdf5.dataset(places.detector, name)
-        wrong = set() if key is None else set(np.unique(key[()]).tolist()) - legal
+        wrong = set() if key is None else set(np.unique(hdf5.values_of(key)).tolist()) - legal
         if wrong:
             yield Finding("error", "key-codes", f"{name} holds {sorted(wrong)}; legal are {sorted(legal)}.")
 
@@ -160,7 +160,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     another part of a joined file. Not always at 0, for the first frame may be lost.
     """
     stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
-    key = np.ravel(places.image_key[()])[: stamps.size]
+    key = np.ravel(hdf5.values_of(places.image_key))[: stamps.size]
     if stamps.size < 2 or key.size < stamps.size or triggers.size != stamps.size or (stamps < 0).any():
         return
     steps = np.diff(stamps)
@@ -237,5 +237,5 @@ RULES: tuple[Rule, ...] = (
 
 def _column(places: Places, path: str) -> NDArray[Any]:
     item = hdf5.dataset(places.entry, path)
-    values = np.empty(0) if item is None else np.ravel(item[()])
+    values = np.empty(0) if item is None else np.ravel(hdf5.values_of(item))
     return values.astype(np.float64)

@@ -155,27 +155,37 @@ def marked(text: str) -> dict[str, Any] | None:
         return None
     try:
         facts = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return facts if isinstance(facts, dict) and facts.get("format") == VOLUME else None
 
 
-def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
-    """The record that `facts_of` describes, of these values [z, y, x]; a window is among its parameters."""
-    z, y, x = facts["centre_zyx"]
-    grid = Grid(values.shape, facts["voxel_size"], (z, y, x), facts["slice_pitch"])
-    window = {"window": np.asarray(facts["window"])} if "window" in facts else {}
-    return ReconRecord(
-        volume=Volume(values, grid),
-        length_unit=facts["length_unit"],
-        raw_file=facts["raw_file"],
-        title=facts["title"],
-        sample=facts["sample"],
-        time=datetime.fromisoformat(facts["date"]).timestamp(),
-        parameters={**facts["parameters"], **window},
-        metrics=facts["metrics"],
-        kind=VoxelKind.of_unit(str(facts.get("values"))),
-    )
+def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
+    """The record that `facts_of` describes, of these values [z, y, x]; a window is among its parameters.
+
+    Raises:
+        DataError: somebody has changed the facts.
+    """
+    try:
+        z, y, x = map(float, facts["centre_zyx"])
+        pitch = facts["slice_pitch"]
+        grid = Grid(values.shape, float(facts["voxel_size"]), (z, y, x), None if pitch is None else float(pitch))
+        window = {"window": np.asarray(facts["window"], float).reshape(2)} if "window" in facts else {}
+        return ReconRecord(
+            volume=Volume(values, grid),
+            length_unit=str(facts["length_unit"]),
+            raw_file=str(facts["raw_file"]),
+            title=str(facts["title"]),
+            sample=str(facts["sample"]),
+            time=datetime.fromisoformat(facts["date"]).timestamp(),
+            parameters={**facts["parameters"], **window},
+            metrics={name: float(value) for name, value in facts["metrics"].items()},
+            kind=VoxelKind.of_unit(str(facts.get("values"))),
+        )
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
+        raise DataError(
+            f"{path} does not say what a volume of this program says ({type(error).__name__}: {error}): it was changed."
+        ) from error
 
 
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import SETTINGS, bytes_below, open_below
+from beamline.storage.foreign_zarr import is_halved
+from beamline.storage.header import dtype_of, require_held, shape_of
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
@@ -25,6 +30,7 @@ from beamline.storage.writers.recon_file import ReconRecord
 
 _CHUNK = 16, 256, 256  # voxels
 _SMALLEST = 256  # voxels along a side, below which no further scale is made
+_SCALES = 32  # at most: each halves the one before
 _META = "zarr.json"
 _KEY = "splatline"
 
@@ -56,12 +62,15 @@ class OmeZarr:
         facts = _facts(path)
         assert facts is not None
         try:
-            scales = [_opened(path / "0")]
-            while (path / str(len(scales)) / _META).is_file():
-                scales.append(_opened(path / str(len(scales))))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            scales = [_opened(path, "0")]
+            with suppress(FileNotFoundError):
+                for n in range(1, _SCALES):
+                    scales.append(_opened(path, str(n)))
+            if not all(is_halved(scales[0].shape, scale) for scale in scales):
+                raise ValueError(f"its scales have the shapes {[scale.shape for scale in scales]}")
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
-        yield record_of(facts, replace(scales[0], coarser=tuple(scales[1:])))
+        yield record_of(path, facts, replace(scales[0], coarser=tuple(scales[1:])))
 
 
 class _Scale:
@@ -112,19 +121,20 @@ class _Scale:
                 (row / str(j)).write_bytes(whole.data)
 
 
-def _opened(folder: Path) -> _Chunks:
-    said = json.loads((folder / _META).read_text(encoding="utf-8"))
-    if (codecs := [each["name"] for each in said["codecs"]]) != ["bytes"]:
+def _opened(path: Path, name: str) -> _Chunks:
+    said = json.loads(bytes_below(path, f"{name}/{_META}", SETTINGS))
+    if (codecs := [str(each["name"]) for each in said["codecs"]]) != ["bytes"]:
         raise ValueError(f"its chunks are encoded by {', '.join(codecs)}, and only plain ones are read")
-    chunk = tuple(said["chunk_grid"]["configuration"]["chunk_shape"])
-    return _Chunks(folder, tuple(said["shape"]), chunk, np.dtype(said["data_type"]).newbyteorder("<"))
+    chunk = shape_of(said["chunk_grid"]["configuration"]["chunk_shape"], "chunk")
+    return _Chunks(path, name, shape_of(said["shape"]), chunk, dtype_of(said["data_type"]))
 
 
 @dataclass(frozen=True)
 class _Chunks:
     """A scale, which is sliced along z as an array is; of the finest one, `coarser` has the others (`base.Scale`)."""
 
-    folder: Path
+    path: Path  # of the whole volume
+    name: str
     shape: tuple[int, int, int]
     chunk: tuple[int, int, int]
     dtype: np.dtype[Any]
@@ -160,13 +170,17 @@ class _Chunks:
         return np.concatenate(lines, axis=1)[:, :rows, :cols]
 
     def _read(self, *at: int, mapped: bool = False) -> NDArray[Any]:
-        path = self.folder.joinpath("c", *map(str, at))
+        name, n_bytes = "/".join((self.name, "c", *map(str, at))), math.prod(self.chunk) * self.dtype.itemsize
         try:
-            if mapped:
-                return np.memmap(path, self.dtype, "r", shape=self.chunk)
-            return np.fromfile(path, self.dtype).reshape(self.chunk)
+            with open_below(self.path, name, n_bytes) as file:
+                require_held(self.chunk, self.dtype, 0, os.fstat(file.fileno()).st_size)
+                if mapped:
+                    return np.memmap(file, self.dtype, "r", shape=self.chunk)
+                return np.fromfile(file, self.dtype, math.prod(self.chunk)).reshape(self.chunk)
         except (OSError, ValueError) as error:
-            raise DataError(f"{path} cannot be read ({error}): the volume is cut off, or was changed.") from error
+            raise DataError(
+                f"{self.path / name} cannot be read ({error}): the volume is cut off, or was changed."
+            ) from error
 
 
 def _levels(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
@@ -212,9 +226,9 @@ def _ome(record: ReconRecord, levels: list[tuple[int, int, int]]) -> dict[str, A
 
 def _facts(path: Path) -> dict[str, Any] | None:
     try:
-        text = (path / _META).read_text(encoding="utf-8")
+        text = bytes_below(path, _META).decode()
         return marked(json.loads(text)["attributes"][_KEY]) if VOLUME in text else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import DataError
+from beamline.storage.header import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
@@ -52,17 +53,19 @@ class Nrrd:
     def open(self, path: Path) -> Iterator[ReconRecord]:
         header, begin = _header(path)
         fields = dict(line.split(b": ", 1) for line in header.splitlines() if b": " in line and b":=" not in line)
-        (said,) = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
-        facts = marked(_unescaped(said))
+        said = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
         kinds = {name.encode(): bits for bits, name in _TYPES.items()}
         try:
-            nx, ny, nz = map(int, fields[b"sizes"].split())
-            dtype = {32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]]
-            values = np.memmap(path, dtype, "r", begin, (nz, ny, nx))
-        except (KeyError, ValueError) as error:
+            facts = marked(_unescaped(said[0])) if len(said) == 1 else None
+            if facts is None:
+                raise ValueError(f"its field {_KEY.decode()} is not that of this program")
+            shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])
+            dtype = dtype_of({32: "<f4", 16: "<u2", 8: "u1"}[kinds[fields[b"type"]]])
+            require_held(shape, dtype, begin, path.stat().st_size)
+            values = np.memmap(path, dtype, "r", begin, shape)
+        except (KeyError, ValueError, OSError) as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
-        assert facts is not None
-        yield record_of(facts, values)
+        yield record_of(path, facts, values)
 
 
 @dataclass(frozen=True)
@@ -85,10 +88,11 @@ class Npy:
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:
-            values = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError, EOFError):
+            with path.open("rb") as file:
+                shape, dtype = require_npy(file)
+        except (OSError, ValueError, EOFError, OverflowError, TypeError):
             return False
-        return isinstance(values, np.ndarray) and values.ndim == 3 and values.dtype.kind in "uif"
+        return len(shape) == 3 and dtype.kind in "uif"
 
     @contextmanager
     def open(self, path: Path) -> Iterator[ReconRecord]:

@@ -15,6 +15,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.header import dtype_of, shape_of
 from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
@@ -54,12 +55,14 @@ class TiffVolume:
         try:
             with Complaints() as complaints, tifffile.TiffFile(path) as tif:
                 pages = len(tif.pages)
-                values: NDArray[Any] = tifffile.memmap(path, mode="r").reshape(facts["shape"])
-            if complaints.said or pages != facts["shape"][0]:
-                raise ValueError(f"{pages} of {facts['shape'][0]} slices, {'; '.join(complaints.said)}")
+                shape = shape_of(facts.get("shape"))
+                values: NDArray[Any] = tifffile.memmap(path, mode="r").reshape(shape)
+                dtype_of(values.dtype.str)
+            if complaints.said or pages != shape[0]:
+                raise ValueError(f"{pages} of {shape[0]} slices, {'; '.join(complaints.said)}")
         except UNREADABLE as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
-        yield record_of(facts, values)
+        yield record_of(path, facts, values)
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,17 @@ class TiffFolderVolume:
     def open(self, path: Path) -> Iterator[ReconRecord]:
         facts = _facts(_slice(path, 0))
         assert facts is not None
-        missing = [z for z in range(facts["slices"]) if not _slice(path, z).is_file()]
-        if missing:
-            raise DataError(
-                f"{path} lacks {len(missing)} of {facts['slices']} slices (first: {_slice(path, missing[0]).name})."
-            )
-        yield record_of(facts, _Stack(path, (facts["slices"], *facts["shape"][-2:])))
+        try:
+            said = facts.get("shape")
+            shape = shape_of([facts.get("slices"), *(said[-2:] if isinstance(said, list) else ())])
+        except ValueError as error:
+            raise DataError(f"{path} cannot be read as a volume ({error}): it was changed.") from error
+        there = {item.name for item in path.iterdir()}
+        first = next((z for z in range(shape[0]) if _slice(path, z).name not in there), None)
+        if first is not None:
+            missing = shape[0] - sum(_slice(path, z).name in there for z in range(min(shape[0], first + len(there))))
+            raise DataError(f"{path} lacks {missing} of {shape[0]} slices (first: {_slice(path, first).name}).")
+        yield record_of(path, facts, _Stack(path, shape))
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ DEFINITION = "NXtomoproc"
 FBP, DEVIATION = "fbp", "data_errors"
 """Datasets beside the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
+_MODEL = 2**32  # bytes of a list of Gaussians
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {
     "centres": "length", "widths": "length", "densities": "voxel", "density_unit": "voxel",
@@ -256,7 +257,7 @@ def volumes_in_time(file: h5py.File) -> int:
 
 def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
-    z, y, x = (np.asarray(data[name][:]) for name in ("z", "y", "x"))
+    z, y, x = (np.asarray(hdf5.values_of(data[name])) for name in ("z", "y", "x"))
     # An axis of one voxel says nothing about the voxel size, the longer one says it best; slices may be higher.
     height = _pitch(z)
     size = _pitch(max(y, x, key=len)) or height or 1.0
@@ -267,18 +268,18 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
         series = VolumesInTime(np.asarray(data["time"][:]), stored)
         stored = series.each()[at]
     grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
-    parameters = {name: value_of(node) for name, node in process["parameters"].items()}
+    parameters = {name: _own_value(node) for name, node in process["parameters"].items()}
     return ReconRecord(
         volume=Volume(stored, grid),
         length_unit=str(data["x"].attrs["units"]),
         raw_file=str(parameters.pop("raw_file")),
-        title=str(value_of(entry["title"])),
-        sample=str(value_of(entry["sample/name"])),
+        title=str(_own_value(entry["title"])),
+        sample=str(_own_value(entry["sample/name"])),
         time=datetime.fromisoformat(str(value_of(process["date"]))).timestamp(),
         parameters=parameters,
-        metrics={name: float(node[()]) for name, node in process["metrics"].items()},
-        history={name: np.asarray(node[()]) for name, node in process["history"].items()},
-        model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
+        metrics={name: float(hdf5.values_of(node)) for name, node in process["metrics"].items()},
+        history={name: np.asarray(hdf5.values_of(node)) for name, node in process["history"].items()},
+        model={name: value_of(node, _MODEL) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
         kind=VoxelKind.of_unit(str(data["data"].attrs.get("units"))),
@@ -291,9 +292,13 @@ def _pitch(axis: NDArray[np.floating]) -> float | None:
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 
-def value_of(node: h5py.Dataset) -> Value:
-    """What a dataset holds, as plain text or number where it is one."""
-    value = node[()]
+def _own_value(node: h5py.Dataset) -> Value:
+    return "" if hdf5.is_foreign(node) else value_of(node)
+
+
+def value_of(node: h5py.Dataset, most: float = hdf5.BRIEF) -> Value:
+    """What a dataset of so many bytes at most holds, as plain text or number where it is one."""
+    value = hdf5.values_of(node, most)
     if isinstance(value, bytes):
         return value.decode()
     return value.item() if isinstance(value, np.generic) else value

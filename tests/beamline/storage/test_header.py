@@ -1,0 +1,196 @@
+"""Headers that somebody has changed are refused in words, whatever their numbers are, and no pipe or link is read."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.storage.describe import describe
+from beamline.storage.header import dtype_of, require_held, shape_of
+from beamline.storage.volume_file import read_volume
+from beamline.storage.volumes import tiff
+from beamline.storage.volumes.files import opened_volume, write_volume
+from tests.beamline.storage.volumes.test_files import RECORD
+
+NUMBERS: tuple[Any, ...] = (
+    0,
+    -1,
+    1.5,
+    "abc",
+    None,
+    True,
+    [],
+    {},
+    2**31,
+    2**62,
+    10**4000,
+    -(10**400),
+    1e300,
+    "9" * 5000,
+)
+
+
+@pytest.mark.parametrize("n", NUMBERS, ids=range(len(NUMBERS)))
+def test_a_side_is_a_whole_number_of_a_volume_that_can_be(n: Any) -> None:
+    for said in ([n, 2, 2], [2, n, 2], [2, 2, n], [n], n, (2**30, 2**30, 2**30)):
+        with pytest.raises(ValueError, match=r"^.{1,200}$"):
+            shape_of(said)
+
+
+@pytest.mark.parametrize("said", ["O", "S8", "U2", "V3", "c8", "f16", "M8[s]", "no", None, 7, ["f4"], "f4,f4", "bool"])
+def test_voxels_are_real_numbers(said: Any) -> None:
+    with pytest.raises((ValueError, TypeError)):
+        dtype_of(said)
+
+
+def test_voxels_are_within_the_file() -> None:
+    require_held((2, 3, 4), np.dtype("u2"), 100, 148)
+    for begin, stored in ((100, 147), (101, 148), (-1, 1000), (2**62, 148)):
+        with pytest.raises(ValueError, match="bytes"):
+            require_held((2, 3, 4), np.dtype("u2"), begin, stored)
+
+
+def _read_all(path: Path) -> None:
+    with opened_volume(path) as record:
+        np.asarray(record.volume.data[:])
+        for scale in getattr(record.volume.data, "coarser", ()):
+            scale.box((0, 0, 0), scale.shape)
+
+
+def _refused(path: Path) -> None:
+    """Each way to read it ends with a sentence."""
+    for work in (_read_all, describe, read_volume):
+        try:
+            work(path)
+        except DataError:
+            continue
+        assert work is not _read_all, "read"
+
+
+def _place(said: Any, where: str) -> tuple[Any, Any]:
+    *way, last = [int(key) if key.isdecimal() else key for key in where.split("/")]
+    for key in way:
+        said = said[key]
+    return said, last
+
+
+@pytest.mark.parametrize(
+    "where", ["shape", "shape/0", "shape/2", "chunk_grid/configuration/chunk_shape", "data_type", "codecs", "codecs/0",
+              "chunk_grid/configuration/chunk_shape/1", "codecs/0/name", "chunk_grid"],
+)  # fmt: skip
+@pytest.mark.parametrize("scale", ["0", "1"])
+def test_ome_zarr(tmp_path: Path, where: str, scale: str) -> None:
+    write_volume(tmp_path / "v.ome.zarr", RECORD)
+    if scale == "1":
+        (tmp_path / "v.ome.zarr/0").joinpath("x").mkdir()
+        text = (tmp_path / "v.ome.zarr/0/zarr.json").read_text()
+        (tmp_path / "v.ome.zarr/1").mkdir()
+        (tmp_path / "v.ome.zarr/1/zarr.json").write_text(text)
+    head = tmp_path / "v.ome.zarr" / scale / "zarr.json"
+    good = head.read_text()
+    for n in NUMBERS:
+        said = json.loads(good)
+        group, key = _place(said, where)
+        group[key] = n
+        head.write_text(json.dumps(said))
+        _refused(tmp_path / "v.ome.zarr")
+
+
+FACTS = ("voxel_size", "slice_pitch", "centre_zyx", "date", "parameters", "metrics", "length_unit", "title")
+
+
+@pytest.mark.parametrize("where", [*FACTS, "centre_zyx/0", "metrics/psnr_db"])
+def test_facts_of_another_type_are_refused_or_words(tmp_path: Path, where: str) -> None:
+    write_volume(tmp_path / "v.nrrd", RECORD)
+    content = (tmp_path / "v.nrrd").read_bytes()
+    head, _, voxels = content.partition(b"\n\n")
+    before, _, text = head.partition(b"splatline:=")
+    for n in (*NUMBERS, "\x1b[2J"):
+        said = json.loads(text.replace(b"\\\\", b"\\"))
+        said["metrics"] = {"psnr_db": 1.0}
+        group, key = _place(said, where)
+        group[key] = n
+        changed = json.dumps(said).replace("\\", "\\\\").encode()
+        (tmp_path / "v.nrrd").write_bytes(before + b"splatline:=" + changed + b"\n\n" + voxels)
+        for work in (_read_all, describe):
+            try:
+                work(tmp_path / "v.nrrd")
+            except DataError as error:
+                assert "v.nrrd" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        *((rb"sizes: \d+", b"sizes: %s" % n) for n in (b"0", b"-1", b"1.5", b"a", b"", b"4294967296", b"9" * 5000)),
+        (rb"type: \w+", b"type: block"), (rb"splatline:=.*", b""), (rb"splatline:=", b"splatline :="),
+        (rb"splatline:=", b"splatline:=x"), (rb"splatline:=", b"splatline:=[]\nsplatline:="),
+        (rb"(splatline:=).*", b"splatline:={splatline volume}"), (rb"sizes.*\n", b""), (rb"\n\n", b"\n"),
+        (rb"splatline:=.*", b'splatline:={"format": "splatline volume"}'), (rb"\x00", b""),
+    ],
+)  # fmt: skip
+def test_nrrd(tmp_path: Path, old: bytes, new: bytes) -> None:
+    write_volume(tmp_path / "v.nrrd", RECORD)
+    content = re.sub(old, lambda match: new, (tmp_path / "v.nrrd").read_bytes(), count=1)
+    (tmp_path / "v.nrrd").write_bytes(content)
+    _refused(tmp_path / "v.nrrd")
+
+
+@pytest.mark.parametrize(
+    "shape", ["(-1, 2, 2)", "(0, 2, 2)", "(2**40, 2, 2)", "(1.5, 2, 2)", f"({2**62}, 4, 4)", f"({'9' * 5000},)"]
+)
+def test_npy(tmp_path: Path, shape: str) -> None:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    content = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(64)
+    (tmp_path / "v.npy").write_bytes(content if len(header) < 2**16 else b"")
+    _refused(tmp_path / "v.npy")
+
+
+@pytest.mark.parametrize("suffix", [".tif", ""])
+@pytest.mark.parametrize("n", NUMBERS, ids=range(len(NUMBERS)))
+def test_tiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, n: Any) -> None:
+    path, key = tmp_path / f"v{suffix}", "shape" if suffix else "slices"
+    write_volume(path, RECORD)
+    facts = tiff._facts(path if suffix else path / "slice_00000.tif")
+    assert facts is not None
+    for said in (n, [n, 4, 5], [3, 4, n]):
+        monkeypatch.setattr(tiff, "_facts", lambda path, said=said: {**facts, key: said})
+        with pytest.raises(DataError):
+            _read_all(path)
+
+
+WAYS: dict[str, Callable[[Path, Path], None]] = {
+    "pipe": lambda place, other: os.mkfifo(place),
+    "link": lambda place, other: place.symlink_to(other),
+    "link to a device": lambda place, other: place.symlink_to("/dev/zero"),
+    "folder": lambda place, other: place.mkdir(),
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes take rights on Windows")
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", ["zarr.json", "0/zarr.json", "0/c/0/0/0"])
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_file_of_a_zarr_that_is_none(tmp_path: Path, way: str, name: str, ours: bool) -> None:
+    path = tmp_path / "v.ome.zarr"
+    write_volume(path, RECORD)
+    if not ours:
+        pytest.importorskip("zarr", reason="extra oracle")
+        head = json.loads((path / "zarr.json").read_text())
+        del head["attributes"]["splatline"]
+        (path / "zarr.json").write_text(json.dumps(head))
+    moved = (path / name).rename(tmp_path / "moved")
+    WAYS[way](path / name, moved)
+    if name == "zarr.json" and way in ("pipe", "folder"):  # then it is a folder of something else
+        with pytest.raises(DataError):
+            describe(path)
+        return
+    _refused(path)
