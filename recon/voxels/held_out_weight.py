@@ -233,19 +233,31 @@ def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
     None where `first` is as good as any, and as `preferred_weight`. Also where voxels are as fine as pixels, rows are
     few, or the middle ones show little matter: a fan took nine times as long, and had the same weight.
     """
-    geometry, grid = problem.projector.geometry, problem.projector.grid
-    pays = grid.voxel_size >= _COARSE * geometry.sample_pitch and geometry.detector_shape[0] >= _FEWEST_ROWS
+    geometry = problem.projector.geometry
+    pays = is_coarse_cone(problem.projector) and geometry.detector_shape[0] >= _FEWEST_ROWS
     pays = pays and geometry.n_views >= LEAST_VIEWS and first > 0
     trial = Trial.of_cone(problem) if pays and problem.trial_goes_on() else None
-    if trial is None:
-        return None
+    return None if trial is None else heaviest_in_octaves(trial, first)
+
+
+def is_coarse_cone(projector: Projector) -> bool:
+    """Voxels of a cone are so coarse that they cannot explain the edges of its views, see `heaviest_weight`."""
+    geometry = projector.geometry
+    return geometry.is_cone and projector.grid.voxel_size >= _COARSE * geometry.sample_pitch
+
+
+def heaviest_in_octaves(error: Callable[[float], float], first: float) -> float | None:
+    """The heaviest weight, or other strength of a prior, whose error is nearly the least, in octaves from `first` on.
+
+    None: `first` is, or the trials were ended.
+    """
     least, heaviest = math.inf, None
     for octave in range(_CONE_OCTAVES):
-        error = trial(first * 2.0**octave)
-        if math.isinf(error):  # the trials were ended
+        left = error(first * 2.0**octave)
+        if math.isinf(left):  # the trials were ended
             return None
-        least = min(least, error)
-        if error > _AS_WELL * least:
+        least = min(least, left)
+        if left > _AS_WELL * least:
             break
         heaviest = octave
     return first * 2.0**heaviest if heaviest else None

@@ -11,7 +11,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out_weight import Trial, least_in_octaves
+from recon.voxels.held_out_weight import Trial, heaviest_in_octaves, is_coarse_cone, least_in_octaves
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
@@ -79,7 +79,8 @@ class PnpDct:
 
 
 def preferred_strength(problem: VoxelProblem, weight: float) -> float:
-    """The strength of `pnp_dct` that views held out prefer, as `preferred_weight` seeks a weight of total variation.
+    """The strength of `pnp_dct` that views held out prefer, sought as `preferred_weight` and, of coarse voxels,
+    `heaviest_weight` seek a weight of total variation.
 
     It begins at the noise that a volume of all views has without a prior. That is also the strength where no views can
     be held out. Neither knows of the densest matter: weak matter beside metal keeps its detail.
@@ -93,7 +94,11 @@ def preferred_strength(problem: VoxelProblem, weight: float) -> float:
         return first
     trial.begin_from(weight)
     steps = PnpDct().iterations
-    found = least_in_octaves(
-        lambda strength: trial.left_by(lambda part, x: pnp_dct(part, x, strength, steps=steps)), first
-    )
+
+    def error(strength: float) -> float:
+        return trial.left_by(lambda part, x: pnp_dct(part, x, strength, steps=steps))
+
+    if is_coarse_cone(problem.projector):
+        return heaviest_in_octaves(error, first) or first
+    found = least_in_octaves(error, first)
     return first if found is None else found.weight
