@@ -33,7 +33,7 @@ class PnpDct:
 
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
-    traits: ClassVar[Traits] = Traits(halo=24)
+    traits: ClassVar[Traits] = Traits(halo=16)
 
     iterations: int = 35
     patch_threshold: float | None = None
