@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from recon.voxels.methods.fista_tv import FistaTv
     from recon.voxels.methods.mlem import Mlem, Osem
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
+    from recon.voxels.methods.pnp_dct import PnpDct
     from recon.voxels.methods.sart import Sart
     from recon.voxels.methods.sirt import Sirt
     from recon.voxels.projector import Projector
@@ -76,6 +77,7 @@ __all__ = [
     "Mlem",
     "OsSirtTv",
     "Osem",
+    "PnpDct",
     "Progress",
     "Projections",
     "Projector",

@@ -46,6 +46,7 @@ REGISTRY: dict[str, MethodEntry] = {
     "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
+    "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
     "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
     "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
     "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),

@@ -24,7 +24,8 @@ from recon.methods import DEFAULT, build, by_name, has_setting, names, taking, w
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
     "kernel": "fit.kernel", "early_stop": "early_stop", "finish": "finish", "iterations": "iterations",
-    "tv_weight": "tv_weight", "allow_negative": "allow_negative", "plain_splatting": "fit.rays.rectified",
+    "tv_weight": "tv_weight", "patch_threshold": "patch_threshold", "allow_negative": "allow_negative",
+    "plain_splatting": "fit.rays.rectified",
 }  # fmt: skip
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
@@ -38,7 +39,7 @@ _INVERTED = ("plain_splatting",)  # flags that switch their setting off
 PRESETS_OF_METHODS = ("published",)
 """Endings of names of methods that are variants of another method, such as r2-published."""
 
-_ROW_SETTINGS = ("steps", "gaussians", "finish", "iterations", "tv_weight")
+_ROW_SETTINGS = ("steps", "gaussians", "finish", "iterations", "tv_weight", "patch_threshold")
 _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
 _OF_A_FIT = (
@@ -236,13 +237,19 @@ _ITERATIONS = click.option(
 _TV_WEIGHT = click.option(
     "--tv-weight", type=POSITIVE, help="Weight of the total variation, relative to the density of the sample."
 )
+_PATCH_THRESHOLD = click.option(
+    "--patch-threshold",
+    type=POSITIVE,
+    help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
+    "Default: as views held out prefer.",
+)
 _ALLOW_NEGATIVE = click.option(
     "--allow-negative",
     is_flag=True,
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
-row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
+row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
 """The options of methods for every row of a table: length and start of the work."""
 equal_time = click.option(
     "--seconds",
@@ -311,6 +318,7 @@ method_options = together(
     heading(METHOD),
     _ITERATIONS,
     _TV_WEIGHT,
+    _PATCH_THRESHOLD,
     _ALLOW_NEGATIVE,
     click.option(
         "--plain-splatting",

@@ -129,6 +129,7 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
     "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
     "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),
     "os-sirt-tv": partial(_iterations, (5, 15), (5, 10, 20, 40)),
+    "pnp-dct": partial(_iterations, (35,), (15, 35, 70)),
 }
 
 MOTION: Mapping[str, tuple[bool | None, int]] = {"none": (False, 2), "learnt": (True, 3), "chosen": (None, 5)}
@@ -143,6 +144,7 @@ JOINT: Mapping[str, Callable[[Mapping[str, Plain]], float]] = {
 COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
+    "pnp-dct": "maroon",
     "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
     "series": "darkgreen", "materials": "darkgreen",
 }  # fmt: skip

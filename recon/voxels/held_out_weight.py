@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -195,7 +196,13 @@ def preferred_weight(problem: VoxelProblem, first: float) -> Preferred | None:
     geometry = problem.projector.geometry
     if not (_can_hold_out(geometry) and first > 0 and problem.trial_goes_on()):
         return None
-    error = _Trial.of(problem)
+    return least_in_octaves(Trial.of(problem), first)
+
+
+def least_in_octaves(error: Callable[[float], float], first: float) -> Preferred | None:
+    """The weight, or another strength of a prior, of the least error, sought in octaves from `first`; see
+    `preferred_weight`. None: an error is infinite, since the trials were ended.
+    """
     errors = {octave: error(first * 2.0**octave) for octave in (1, 0)}
     towards, slack = (1, _LEVEL) if errors[1] < _LEVEL * errors[0] else (-1, 1.0)
     at = max(towards, 0)
@@ -225,19 +232,31 @@ def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
     None where `first` is as good as any, and as `preferred_weight`. Also where voxels are as fine as pixels, rows are
     few, or the middle ones show little matter: a fan took nine times as long, and had the same weight.
     """
-    geometry, grid = problem.projector.geometry, problem.projector.grid
-    pays = grid.voxel_size >= _COARSE * geometry.sample_pitch and geometry.detector_shape[0] >= _FEWEST_ROWS
+    geometry = problem.projector.geometry
+    pays = is_coarse_cone(problem.projector) and geometry.detector_shape[0] >= _FEWEST_ROWS
     pays = pays and geometry.n_views >= LEAST_VIEWS and first > 0
-    trial = _Trial.of_cone(problem) if pays and problem.trial_goes_on() else None
-    if trial is None:
-        return None
+    trial = Trial.of_cone(problem) if pays and problem.trial_goes_on() else None
+    return None if trial is None else heaviest_in_octaves(trial, first)
+
+
+def is_coarse_cone(projector: Projector) -> bool:
+    """Voxels of a cone are so coarse that they cannot explain the edges of its views, see `heaviest_weight`."""
+    geometry = projector.geometry
+    return geometry.is_cone and projector.grid.voxel_size >= _COARSE * geometry.sample_pitch
+
+
+def heaviest_in_octaves(error: Callable[[float], float], first: float) -> float | None:
+    """The heaviest weight, or other strength of a prior, whose error is nearly the least, in octaves from `first` on.
+
+    None: `first` is, or the trials were ended.
+    """
     least, heaviest = math.inf, None
     for octave in range(_CONE_OCTAVES):
-        error = trial(first * 2.0**octave)
-        if math.isinf(error):  # the trials were ended
+        left = error(first * 2.0**octave)
+        if math.isinf(left):  # the trials were ended
             return None
-        least = min(least, error)
-        if error > _AS_WELL * least:
+        least = min(least, left)
+        if left > _AS_WELL * least:
             break
         heaviest = octave
     return first * 2.0**heaviest if heaviest else None
@@ -250,7 +269,7 @@ def bregman_weight(problem: VoxelProblem, weight: float, residual: float | None 
     At the same noise two runs show more of a crack than one, most where views are few (docs/notes/exploration.md).
     `residual`: of the search for `weight`; where two runs are clearly above it, one run is not tried again.
     """
-    error = _Trial.of(problem)
+    error = Trial.of(problem)
     heavy = error(_HEAVY * weight, twice=True)
     if residual is not None and heavy > _BY_CHANCE * residual:
         return None
@@ -286,7 +305,7 @@ def residuals_of_rounds(
     errors: list[float] = []
     if not slices_are_rows(problem.projector):
         return errors
-    trial = _Trial.of(problem, start)
+    trial = Trial.of(problem, start)
     x = trial.start.copy()
 
     def further(sweep: int, residual: float) -> bool:
@@ -302,7 +321,7 @@ def residuals_of_rounds(
     return errors
 
 
-class _Trial:
+class Trial:
     """Volumes of a slab with several weights, judged by views that the trials have not seen."""
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
@@ -311,21 +330,32 @@ class _Trial:
         self._asked, self._ended = problem.go_on, False
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32 | None = None) -> _Trial:
+    def of(cls, problem: VoxelProblem, start: F32 | None = None) -> Trial:
         """The trial of the rows with most matter, from those slices of `start` [y, x, z]; None: from FBP."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         rows = busiest_rows(problem.data.swapaxes(1, 2), _ROWS)
         return cls._of_rows(problem, rows, *slab_of(geometry, grid, rows.start, rows.stop), start)
 
     @classmethod
-    def of_cone(cls, problem: VoxelProblem) -> _Trial | None:
+    def of_cone(cls, problem: VoxelProblem) -> Trial | None:
         """The trial of the middle rows, from their FDK; None as `middle_of_cone`."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         found = middle_of_cone(geometry, grid, problem.data.swapaxes(1, 2), _ROWS)
         return None if found is None else cls._of_rows(problem, *found, None)
 
     @classmethod
-    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, start: F32 | None) -> _Trial:
+    def of_some_rows(cls, problem: VoxelProblem) -> Trial | None:
+        """The trial of a parallel beam or of a cone. None: fewer than 16 views, or a cone as `middle_of_cone`."""
+        geometry, grid = problem.projector.geometry, problem.projector.grid
+        if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
+            return None
+        if not geometry.is_cone:
+            return cls.of(problem)
+        rows = geometry.detector_shape[0]
+        return cls.of_cone(problem) if rows > _ROWS else cls._of_rows(problem, slice(0, rows), geometry, grid, None)
+
+    @classmethod
+    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, start: F32 | None) -> Trial:
         def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
             def cut(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, :, rows])
@@ -355,16 +385,25 @@ class _Trial:
         return not self._ended
 
     def __call__(self, weight: float, twice: bool = False) -> float:
-        """Root mean square of what the volume with this weight, of one run or two, leaves of the views held out.
+        """`left_by` the volume with this weight, of one run or two."""
+        run, sweeps = (bregman, _AT_ONCE) if twice else (ordered_fista, _SWEEPS)
+        return self.left_by(lambda problem, x: run(problem, x, weight, self.subsets, sweeps=sweeps, tv_steps=_TV_STEPS))
 
-        Infinite from where the trials are ended on: then no weight is preferred.
+    def left_by(self, made: Callable[[VoxelProblem, F32], F32]) -> float:
+        """Root mean square of what the volume made from the first one leaves of the views held out.
+
+        Infinite from where the trials are ended on: then nothing is preferred.
         """
         if self._ended:
             return math.inf
-        run, sweeps = (bregman, _AT_ONCE) if twice else (ordered_fista, _SWEEPS)
-        problem = replace(self.problem, rng=np.random.default_rng(0))  # the same order of subsets for all
-        x = run(problem, self.start.copy(), weight, self.subsets, sweeps=sweeps, tv_steps=_TV_STEPS)
+        # The same order of subsets for all.
+        x = made(replace(self.problem, rng=np.random.default_rng(0)), self.start.copy())
         return math.inf if self._ended else self.error(x)
+
+    def begin_from(self, weight: float) -> None:
+        """Volumes begin from total variation with this weight instead."""
+        problem = replace(self.problem, rng=np.random.default_rng(0))
+        self.start = ordered_fista(problem, self.start, weight, self.subsets, sweeps=_SWEEPS, tv_steps=_TV_STEPS)
 
     def error(self, x: F32) -> float:
         """Root mean square of what slices [y, x, z] leave of the views held out; infinite where these weigh nothing.

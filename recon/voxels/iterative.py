@@ -41,6 +41,14 @@ class IterativeMethod(Protocol):
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
 
 
+@runtime_checkable
+class PreparedMethod(IterativeMethod, Protocol):
+    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations."""
+
+    @property
+    def first_sweeps(self) -> int: ...
+
+
 def solve(
     method: IterativeMethod,
     projector: Projector,
@@ -113,10 +121,11 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     """
     begin, geometry = control.now(), problem.geometry
     history: list[Progress] = []
+    planned = method.iterations + (method.first_sweeps if isinstance(method, PreparedMethod) else 0)
 
     def report(iteration: int, residual: float) -> bool:
         seconds = control.now() - begin
-        history.append(Progress(iteration, method.iterations, seconds, residual, residual, 0, geometry.n_views))
+        history.append(Progress(iteration, planned, seconds, residual, residual, 0, geometry.n_views))
         if control.on_progress is not None:
             control.on_progress(history[-1])
         return control.should_stop is not None and control.should_stop()

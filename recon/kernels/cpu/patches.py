@@ -1,6 +1,6 @@
-"""Patches on the CPU: every 4 x 4 x 4 block of a volume without its small cosine coefficients, averaged (numba, threaded).
+"""Patches on the CPU: all 4 x 4 x 4 blocks of a volume without small cosine coefficients, averaged (numba, threaded).
 
-    D(x) = 1/64 Σ Rᵀ T⁻¹ H(T R x)        R: a block, T: its orthonormal cosine transform, H: |c| > threshold, or the mean
+    D(x) = 1/64 Σ Rᵀ T⁻¹ H(T R x)        R: a block, T: its orthonormal cosine transform, H: keeps |c| > threshold, c₀
 
 over all blocks that overlap the volume, which is mirrored at its faces. The transform of a plane of a block serves the
 four blocks that share this plane, and their inverse transforms are added before that of the plane.
@@ -128,15 +128,18 @@ def _column(given, out, share, first, end, at, line, depth, threshold, found, su
 
 
 @njit(**OPTIONS)
-def _denoise(given: F32, out: F32, share: F32, blocks: int, line: int, depth: int, threshold: float, step: int) -> None:
-    planes = given.shape[0] - _BEYOND
+def _denoise(
+    given: F32, sums: F32, share: F32, blocks: int, line: int, depth: int, threshold: float, step: int
+) -> None:
+    planes, size = given.shape[0] - _BEYOND, EDGE * EDGE * depth
     tasks = -(-planes // step)
     for odd in range(2):  # neighbouring tasks add to the same planes
         for half in prange((tasks + 1 - odd) // 2):
             first = (2 * half + odd) * step
-            found, sums = np.empty((EDGE * EDGE * depth, 16), np.float32), np.empty((EDGE * EDGE * depth, 16), np.float32)
+            end = min(first + step, planes)
+            found, added = np.empty((size, 16), np.float32), np.empty((size, 16), np.float32)
             for at in range(0, blocks, 16):
-                _column(given, out, share, first, min(first + step, planes), at, line, depth, _f(threshold), found, sums)
+                _column(given, sums, share, first, end, at, line, depth, _f(threshold), found, added)
 
 
 @njit(inline="always")
@@ -183,7 +186,8 @@ def patch_scratch(shape: tuple[int, int, int]) -> PatchScratch:
     share[: nb + _BEYOND, : nc + beyond] = 1 / (EDGE**2 * depth)
     every = np.zeros((1, size), np.float32)
     every[0, : share.size] = share.ravel()
-    return PatchScratch(*(np.zeros((na + 2 * _BEYOND, size), np.float32) for _ in range(2)), every)
+    given, sums = (np.zeros((na + 2 * _BEYOND, size), np.float32) for _ in range(2))
+    return PatchScratch(given, sums, every)
 
 
 def scratch_values(shape: tuple[int, int, int]) -> int:
@@ -218,3 +222,22 @@ def denoise(x: F32, threshold: float, nonnegative: bool, scratch: PatchScratch, 
     step = min(max(na // _TASKS, _LEAST), _MOST)
     _denoise(*scratch, (nb + _BEYOND) * line, line, depth, threshold, step)
     _inner(scratch.sums, beyond, 0.0 if nonnegative else float(np.finfo(np.float32).min), out)
+
+
+@njit(**OPTIONS)
+def _pulled_step(
+    x: F32, change: F32, momentum: float, pace: float, gradient: F32, pull: float, z: F32, floor: float
+) -> None:  # fmt: skip
+    p, q, m, low = _f(momentum), _f(pace), _f(pull), _f(floor)
+    for i in prange(x.size):
+        here = x[i]
+        x[i] = max(here + p * change[i] + q * (gradient[i] + m * (z[i] - here)), low)
+        change[i] = x[i] - here
+
+
+def pulled_step(
+    x: F32, change: F32, momentum: float, pace: float, gradient: F32, pull: float, z: F32, nonnegative: bool
+) -> None:  # fmt: skip
+    """change = momentum change + pace (gradient + pull (z - x)), and x += change, at least 0 with `nonnegative`."""
+    floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
+    _pulled_step(x.reshape(-1), change.reshape(-1), momentum, pace, gradient.reshape(-1), pull, z.reshape(-1), floor)

@@ -51,6 +51,10 @@ class FistaTv:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        return self.with_weight(problem, x)[0]
+
+    def with_weight(self, problem: VoxelProblem, x: F32) -> tuple[F32, float]:
+        """`iterate`, and the weight μ of its last sweep."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
@@ -64,7 +68,8 @@ class FistaTv:
                 "weight", lambda: share * density_unit(x) * largest_eigenvalue(projector, problem.weight)
             )
         subsets = Subsets.of(problem, self.subsets)
-        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
+        x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
+        return x, weight.value if isinstance(weight, NoiseBalance) else weight
 
     def toy(self) -> Self:
         return replace(self, iterations=1)

@@ -25,7 +25,7 @@ FAULTS = {
     "choice": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {method: r3}"),
         "my.yaml:2: recon.method is 'r3'; expected auto | r2 | r2-published | fbp | sirt | sart | cgls | mlem | osem | "
-        "asd-pocs | fista-tv | os-sirt-tv | naf | intratomo | sax-nerf",
+        "asd-pocs | fista-tv | os-sirt-tv | pnp-dct | naf | intratomo | sax-nerf",
     ),
     "scheme": (
         ("scheme: fixed", "scheme: goldn"),

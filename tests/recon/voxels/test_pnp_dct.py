@@ -1,0 +1,148 @@
+"""PnP-DCT: what its steps minimise, what slabs and sides see of it, and small detail that must stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+import recon
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import RunControl
+from recon.base.slabs import part_of, slabs_of
+from recon.base.volume import Grid
+from recon.voxels.pnp_dct import pnp_dct, towards_views
+from recon.voxels.projector import Projector, projection_lines, volume_lines
+from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
+
+F32, F64 = NDArray[np.float32], NDArray[np.float64]
+SIDE, FINE = 80, 4  # voxels, and rays a pixel
+
+
+def problem_of(geometry: Geometry, truth: F32, weight: F32 | None = None, nonnegative: bool = True) -> VoxelProblem:
+    projector = Projector(geometry, Grid.matching(geometry))
+    data = projection_lines(projector.forward(truth))
+    rays = None if weight is None else projection_lines(weight)
+    return VoxelProblem(projector, data, rays, nonnegative, np.random.default_rng(0), lambda *_: True)
+
+
+BEAMS = {
+    "parallel": Geometry.parallel(np.arange(12) * np.pi / 12, (6, 14)),
+    "one row": Geometry.parallel(np.arange(12) * np.pi / 12, (1, 14)),
+    "fan": Geometry.cone(np.arange(12) * np.pi / 6, (1, 14), 1.0, 60.0, 90.0),
+    "cone": Geometry.cone(np.arange(12) * np.pi / 6, (6, 14), 1.0, 60.0, 90.0),
+    "posed": replace(Geometry.parallel(np.arange(12) * np.pi / 12, (6, 14)), roll=np.full(12, 0.05)),
+}
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("beam", list(BEAMS))
+def test_many_steps_solve_the_normal_equations(rng: np.random.Generator, beam: str, weighted: bool) -> None:
+    """(AᵀWA + m) x = AᵀW p + m z, with m = 0.03 L."""
+    geometry = BEAMS[beam]
+    shape = Grid.matching(geometry).shape
+    weight = rng.random((12, *geometry.detector_shape), np.float32) if weighted else None
+    problem = problem_of(geometry, rng.random(shape, np.float32), weight, nonnegative=False)
+    x, z = (volume_lines(rng.random(shape, np.float32)) for _ in range(2))
+    bound = largest_eigenvalue(problem.projector, problem.weight)
+    assert towards_views(problem, x, z, bound, steps=60)
+    left = problem.data - problem.projector.forward_lines(x)
+    gradient = problem.projector.adjoint_lines(left if problem.weight is None else left * problem.weight)
+    np.testing.assert_allclose(gradient, 0.03 * bound * (x - z), atol=1e-3 * np.abs(gradient).max())
+
+
+def test_steps_end_at_the_least_volume_that_is_not_negative(rng: np.random.Generator) -> None:
+    """Karush, Kuhn and Tucker: no gradient where x > 0, none that points inside where x = 0."""
+    problem = problem_of(BEAMS["parallel"], rng.random((6, 14, 14), np.float32) ** 4)
+    x, z = (volume_lines(rng.normal(0, 1, (6, 14, 14)).astype(np.float32)) for _ in range(2))
+    bound = largest_eigenvalue(problem.projector, None)
+    towards_views(problem, np.maximum(x, 0, out=x), z, bound, steps=300)
+    gradient = problem.projector.adjoint_lines(problem.data - problem.projector.forward_lines(x))
+    gradient += 0.03 * bound * (z - x)
+    some = 1e-3 * np.abs(gradient).max()
+    assert x.min() == 0 and (x == 0).mean() > 0.1
+    assert np.abs(gradient[x > 0]).max() < some and gradient[x == 0].max() < some
+
+
+def test_slices_of_a_slab_are_those_of_the_whole_from_three_a_round_beyond_its_edge(rng: np.random.Generator) -> None:
+    """To the bit: nothing but the bound of the eigenvalues is taken from the whole."""
+    rows, steps = 40, 15  # three rounds, and the last threshold: 12 slices
+    geometry = Geometry.parallel(np.arange(20) * np.pi / 20, (rows, 12))
+    truth, start = (rng.random(Grid.matching(geometry).shape, np.float32) for _ in range(2))
+    whole = problem_of(geometry, truth)
+    found = pnp_dct(whole, volume_lines(start), 0.2, steps=steps)
+    for first, end in ((0, 24), (13, 40)):
+        part = problem_of(geometry.rows(first, end), truth[first:end])
+        slab = pnp_dct(
+            replace(part, decide=Decisions(0, whole.decide.made)), volume_lines(start[first:end]), 0.2, steps=steps
+        )
+        inner = slice(first and 12, end - first - (12 if end < rows else 0))
+        np.testing.assert_array_equal(slab[..., inner], found[..., first:end][..., inner])
+
+
+def test_slabs_that_follow_fit_together(rng: np.random.Generator) -> None:
+    """The volumes of total variation differ in the last bits, and these decide on some coefficients: single voxels."""
+    geometry = Geometry.parallel(np.arange(24) * np.pi / 24, (60, 24))
+    grid = Grid.matching(geometry)
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    truth = 0.5 * (np.hypot(x, y) < 10) - 0.3 * (np.abs(z - x) < 1.5) * (np.hypot(x, y) < 8)
+    views = Projector(geometry, grid).forward(truth.astype(np.float32))
+    views += rng.normal(0, 0.01 * views.max(), views.shape).astype(np.float32)
+    decide, method = Decisions(3), recon.PnpDct()
+    whole = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide)).volume.data
+    found = np.zeros_like(whole)
+    for slab in slabs_of(60, 24, method.traits.halo):
+        rows, part, box = part_of(geometry, grid, slab.slices)
+        control = RunControl(decide=Decisions(3, decide.made))
+        volume = recon.reconstruct(views[:, rows], part, method, grid=box, control=control).volume.data
+        found[slab.slices] += slab.share[:, None, None] * volume
+    apart = np.abs(found - whole) / whole.max()
+    assert np.sqrt(np.mean(apart**2)) < 1e-4 and apart.max() < 5e-3
+
+
+def hairlines_and_a_disc(rows: int) -> tuple[F32, Geometry]:
+    """A grain with oblique gaps of half a voxel and of one, grains, among them a disc 2 % lighter than its matter."""
+    rng, n = np.random.default_rng(0), SIDE * FINE
+    y, x = np.meshgrid(*[(np.arange(n) + 0.5) / FINE - SIDE / 2] * 2, indexing="ij")
+    _, near = cKDTree(rng.uniform(-SIDE / 2, SIDE / 2, (60, 2))).query(np.stack([y, x], -1).reshape(-1, 2))
+    grey = rng.uniform(0.85, 1.0, 60)[near].reshape(n, n) * (np.hypot(x, y) < 36)
+    grey[np.hypot(x - 16, y) < 14] = 0.9
+    grey[np.hypot(x - 16, y) < 5] = 0.9 * 0.98
+    grain = (np.abs(x + 14) < 15) & (np.abs(y) < 13)
+    grey[grain] = 1
+    for width, place in GAPS.items():
+        grey[grain & (np.abs(across(x, y, place)) < width / 2) & (np.abs(y) < 11)] = 0
+    angles = np.arange(90) * np.pi / 90
+    fine = Projector(Geometry.parallel(angles, (1, n), pixel_pitch=1 / FINE), Grid((1, n, n), 1 / FINE))
+    clean = fine.forward((2 / SIDE * grey[None]).astype(np.float32))
+    light = np.repeat(np.exp(-clean).reshape(90, 1, SIDE, FINE).mean(3), rows, axis=1)
+    data = -np.log(rng.poisson(1e5 * light) / 1e5)
+    return data.astype(np.float32), Geometry.parallel(angles, (rows, SIDE))
+
+
+GAPS = {0.5: -20.0, 1.0: -10.0}
+
+
+def across(x: F64, y: F64, place: float) -> F64:
+    """Distance from the line of a gap."""
+    return (x - place + 0.2 * y) / np.hypot(1, 0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [1, 8])
+def test_hairlines_and_a_weak_disc_among_grains_stay(rows: int) -> None:
+    """The matter that a gap lacks is 0.85 to 1.15 of its width, the disc's contrast 0.8 to 1.2, 4 times the noise."""
+    volume = recon.reconstruct(*hairlines_and_a_disc(rows), recon.PnpDct()).volume.data[rows // 2] * SIDE / 2
+    y, x = np.meshgrid(*[np.arange(SIDE) + 0.5 - SIDE / 2] * 2, indexing="ij")
+    for width, place in GAPS.items():
+        off, seen = np.abs(across(x, y, place)), np.abs(y) < 9
+        lacking = volume[seen & (off > 2.5) & (off < 4)].mean() - volume[seen & (off < 2)].mean()
+        assert 0.85 * width < 4 * lacking < 1.15 * width
+    off = np.hypot(x - 16, y)
+    disc, around = volume[off < 4], volume[(off > 6.5) & (off < 12)]
+    contrast = float(around.mean() - disc.mean())
+    assert 0.8 < contrast / (0.9 * 0.02) < 1.2 and contrast > 4 * around.std()
