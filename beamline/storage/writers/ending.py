@@ -36,7 +36,7 @@ def ending_in(file: h5py.File) -> Ending:
     """The ending that a scan file of ours states."""
     for path in (layout.STATUS, layout.MISSING):
         hdf5.look_again(file[path])
-    status = hdf5.text(file[layout.STATUS][()]) or RUNNING
+    status = hdf5.text_of(file[layout.STATUS]) or RUNNING
     return Ending(status, tuple(file[layout.MISSING][()].tolist()), hdf5.text_at(file, layout.REASON))
 
 
