@@ -70,6 +70,16 @@ def test_each_failure_has_its_code_and_one_sentence(
 
 
 @pytest.mark.usefixtures("no_debug")
+@pytest.mark.parametrize("error", [SystemExit(0), SystemExit(), GeneratorExit(), BaseException("odd")])
+def test_what_ends_a_command_from_within_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = _run(monkeypatch, error)
+    assert (result.exit_code, result.stdout) == (1, "") and type(error).__name__ in result.stderr
+
+
+@pytest.mark.usefixtures("no_debug")
 def test_a_defect_is_one_sentence_and_a_file_with_its_traceback(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

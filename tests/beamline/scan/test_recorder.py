@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
+from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.mass import MassCheck
@@ -22,6 +23,7 @@ from beamline.monitor.watch import start
 from beamline.scan import recorder as module
 from beamline.scan import run as run_module
 from beamline.scan.recorder import Recorder
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults
@@ -194,6 +196,33 @@ def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(ran.error, DataError)
     assert "took no frame" in str(ran.error)
     ran.assert_safe()
+
+
+def test_an_abort_does_not_wait_for_a_disk_that_hangs_and_no_frame_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free, stop, seconds = threading.Event(), StopRequest(), list[float]()
+
+    class Hanging(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
+            if frame.index == 6:
+                threading.Timer(0.3, stop.abort).start()  # when the scan waits for room
+                free.wait(60)
+            super().append(frame, digest, flags)
+
+    def safe() -> None:
+        if stop.aborting:
+            seconds.append(stop.seconds)
+            free.set()
+
+    monkeypatch.setattr(run_module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(module, "WAITING_FRAMES", (2, 2))
+    instrument = FakeInstrument()
+    monkeypatch.setattr(instrument.devices.shutter, "close", safe)
+    ran = Ran(tmp_path, instrument, "scan.mode=step", stop=stop)
+    assert type(ran.error) is ScanAborted and 0 < seconds[-1] < 2
+    with open_scan(tmp_path / ran.folder / "scan.h5") as source:  # type: ignore[operator]
+        assert len(source.image_key) == instrument.camera.number
 
 
 def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def _assert_told(ran: Ran, place: str) -> None:
 
 @pytest.mark.slow
 def test_a_scan_without_all_its_frames_never_ends_with_exit_code_0() -> None:
-    @settings(max_examples=12, deadline=None)
+    @settings(max_examples=20, deadline=None)
     @given(
         place=st.sampled_from(PLACES), which=st.integers(0, 99), nth=st.integers(0, 24), once=st.booleans(),
         mode=st.sampled_from(("fly", "step")),
