@@ -28,7 +28,7 @@ from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock, scan_frames
 
 
 def _aged(path: Path) -> Path:
@@ -234,3 +234,42 @@ def test_the_head_is_read_and_written_as_hdf5_does(tmp_path: Path) -> None:
     assert closed.intact and not closed.open_for_writing and closed.missing == 0
     assert opened.closed(opened.size).head == closed.head
     assert not replace(closed, head=closed.head[:20] + b"\x01" + closed.head[21:]).intact
+
+
+@pytest.mark.slow
+def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_was_on_the_disk(
+    tmp_path: Path, clock: StandingClock, rng: np.random.Generator
+) -> None:
+    """Any of the pages since the last fsync, which was after 15 frames: HDF5 overwrites its own blocks in place."""
+    frames, on_disk, page = scan_frames(rng, 2, 3, 35), 15, 4096
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
+    for frame in frames:
+        if frame.index == on_disk:
+            before = writer.path.read_bytes()
+        writer.append(frame, digest(frame.counts))
+    after = writer.path.read_bytes()
+    writer.close()
+    pages = [slice(at, at + page) for at in range(0, len(after), page)]
+    anew = 0
+    for trial in range(12):
+        folder = tmp_path / str(trial)
+        folder.mkdir()
+        state, share = bytearray(before.ljust(len(after), b"\0")), rng.uniform()
+        for part in pages:
+            if rng.uniform() < share:
+                state[part] = after[part]
+        (folder / "s.h5").write_bytes(state)
+        done = recover(_aged(folder / "s.h5"))
+        assert on_disk <= done.frames <= len(frames)
+        with open_scan(folder / "s.h5") as source:
+            pixels = source.read(slice(None))
+            wrong = {row for row, image in enumerate(pixels) if (image != frames[row].counts).any()}
+            assert wrong <= {*done.damaged} - {*range(on_disk)} and source.ending.status == "failed"
+            angles = [frame.angle for frame in frames[:on_disk]]
+            np.testing.assert_allclose(source.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
+        assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
+        if (kept := folder / "s.h5.damaged").exists():
+            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.said()
+            anew += 1
+        assert not recover(folder / "s.h5").changed
+    assert anew  # ways that HDF5 cannot end such a file by
