@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.storage.writers.ending import Ending
 from drivers.base.frame import Frame, FrameKind
 
 
@@ -37,6 +38,7 @@ class ArraySource:
     altered: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     finished = True
+    ending = Ending()
     times = None
     emission = None
     plan: dict[str, Any] = {}  # noqa: RUF012

@@ -121,8 +121,9 @@ def test_the_axis_of_one_row_is_found_on_pixels_as_coarse_as_that_of_all_rows(
 
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
     with open_scan(scan) as source:
-        whole = prepare_projections(source, PLAIN, _never).geometry
-        rows = prepare_projections(source, replace(PLAIN, rows=(10, 30), binning=2), _never).geometry
+        given = replace(PLAIN, axis_col=AXIS)  # it is not searched for
+        whole = prepare_projections(source, given, _never).geometry
+        rows = prepare_projections(source, replace(given, rows=(10, 30), binning=2), _never).geometry
     assert rows.detector_shape == (10, 24)
     # The central ray met row 19.5 of the detector: 9.5 of the rows that are read, 4.5 of these in pairs.
     assert (whole.axis_row, rows.axis_row) == (19.5, pytest.approx(4.5))

@@ -16,7 +16,7 @@ from recon.proportions import SOLUTION_STEPS
 from recon.series import TimedViews, TimedVolumes, fit_series, hats, of_moments
 from recon.voxels.projector import Projector
 
-SIDE, ROWS = 40, 4
+SIDE, ROWS = 40, 2
 GOLDEN = np.pi * (np.sqrt(5) - 1) / 2
 
 

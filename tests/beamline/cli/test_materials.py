@@ -70,12 +70,20 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
     return path
 
 
-def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path: Path) -> None:
-    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+@pytest.fixture(scope="module")
+def made(scans: list[Path]) -> Path:
+    """The folder of the volumes of all scans: out_charged.h5 and out_fresh.h5."""
+    folder = scans[0].with_name("made")
+    folder.mkdir()
+    done = run("materials", *scans, "--spectra", spectra(folder), "-o", folder / "out.h5", "--axis", "31.5")
     assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], made: Path) -> None:
     share = {}
     for material in GRAINS:
-        with opened_volume(tmp_path / f"out_{material}.h5") as record:
+        with opened_volume(made / f"out_{material}.h5") as record:
             volume = record.volume
             y, x = (np.mgrid[:64, :64] - 31.5) * PITCH
             share[material] = {
@@ -89,21 +97,20 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path
     for name, other in (("charged", "fresh"), ("fresh", "charged")):
         assert share[name][name] == pytest.approx(1, abs=0.15)
         assert share[other][name] < 0.15
-    again = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5")
+    again = run("materials", *scans, "--spectra", spectra(made), "-o", made / "out.h5")
     assert "never overwritten" in again.output
 
 
-def test_states_of_one_material_keep_their_sum(scans: list[Path], tmp_path: Path) -> None:
+def test_states_of_one_material_keep_their_sum(scans: list[Path], made: Path, tmp_path: Path) -> None:
+    words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--states", "fresh, charged"
+    done = run("materials", *scans, *words)
+    assert done.exit_code == 0, done.output
     found = {}
-    for name, words in (("plain", ()), ("smooth", ("--states", "fresh, charged"))):
-        done = run(
-            "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / f"{name}.h5", "--axis", "31.5", *words
-        )
-        assert done.exit_code == 0, done.output
+    for name, folder, states in (("plain", made, None), ("smooth", tmp_path, "fresh,charged")):
         for material in GRAINS:
-            with opened_volume(tmp_path / f"{name}_{material}.h5") as record:
+            with opened_volume(folder / f"out_{material}.h5") as record:
                 found[name, material] = np.asarray(record.volume.data)
-                assert record.parameters.get("states") == ("fresh,charged" if words else None)
+                assert record.parameters.get("states") == states
     plain, smooth = (sum(found[name, material] for material in GRAINS) for name in ("plain", "smooth"))
     np.testing.assert_allclose(plain, smooth, atol=1e-5)
     inside = smooth > 0.9

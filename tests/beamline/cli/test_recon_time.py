@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.projections.selection import Selection
 from beamline.storage.volumes.files import opened_volume
+from recon.run_time import RunTime
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
 
@@ -31,6 +33,15 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = frames_of(SCAN)
     views = [replace(frame, counts=image) for frame, image in zip(frames[4:], counts, strict=True)]
     return write_flagged(tmp_path_factory.mktemp("fading") / "scan.h5", frames[:4] + views, {})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def weight_given() -> Iterator[None]:
+    """No trials of weights, which take most of the time; tests/recon/test_series.py has them."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("recon.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
+        patched.setattr("beamline.reconstruct.time_series._SWEEPS", 30)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +90,6 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
     assert beamline("export", str(tmp_path / "last.h5"), "--at", "0", "-o", str(tmp_path / "n.npy")).exit_code == 5
 
 
-@pytest.fixture
-def weight_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No trials of weights, which take most of the time."""
-    monkeypatch.setattr("recon.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
-
-
-@pytest.mark.usefixtures("weight_given")
 def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path: Path) -> None:
     page = series.with_suffix(".html").read_text(encoding="utf-8")
     assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
@@ -95,18 +99,15 @@ def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path:
     assert left(tmp_path) == {"s.h5"}
 
 
-@pytest.mark.usefixtures("weight_given")
-def test_a_script_gets_the_volumes_that_the_command_writes(scan: Path, tmp_path: Path) -> None:
-    command = beamline("recon", str(scan), "--time", "2", "--no-moves", "--axis", "19.5", "-o", str(tmp_path / "c.h5"))
-    assert command.exit_code == 0, command.output
+def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: Path, tmp_path: Path) -> None:
     wanted = Selection(axis_col=19.5)
     found = api.reconstruct_series(scan, 2, moves=False, selection=wanted, say=None)
     assert found.output is None and found.report is None and not found.moves and found.units == "1/mm"
     assert found.seconds == pytest.approx((0, SPAN)) and found.axis_col == 19.5
-    with h5py.File(tmp_path / "c.h5") as file:
+    with h5py.File(series) as file:
         np.testing.assert_array_equal(found.volumes, file["entry/data/data"][()])
     kept = api.reconstruct_series(scan, 2, moves=False, selection=wanted, output=tmp_path / "kept.h5", say=None)
-    assert left(tmp_path) == {"c.h5", "c.html", "kept.h5", "kept.html"} and kept.report == tmp_path / "kept.html"
+    assert left(tmp_path) == {"kept.h5", "kept.html"} and kept.report == tmp_path / "kept.html"
     np.testing.assert_array_equal(kept.volumes, found.volumes)
     assert kept.residual == found.residual > 0 and not kept.ended_early
     with pytest.raises(api.ConfigError, match="12 views or more for each"):
@@ -166,7 +167,9 @@ def test_what_does_not_go_together_is_one_line(
 def test_a_dry_run_states_the_memory_and_writes_nothing(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Its seconds are predicted from small fits, which tests/recon/test_series_time.py has."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("beamline.reconstruct.time_series.series_seconds", lambda *_: RunTime(70.0, 30.0))
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert "2 of 2 x 40 x 40 voxels, from 36 views" in done.output
