@@ -18,17 +18,17 @@ from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import learnt_motion, unseen_residuals
+from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
-from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
+from recon.voxels.held_out_weight import ONE_IN, beyond_chance, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
-_MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
-_MOVES = 0.9  # of what volumes leave of views held out: a motion that leaves less is there
-_FACTORS = 0.95  # likewise of its square: factors that leave less are there
+_MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
+_SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
+_FACTORS = 0.95  # of the squares that volumes leave of views held out: factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
@@ -157,13 +157,14 @@ def fit_series(
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
     learnt, left = None, None
-    coarse, coarse_past = of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
-    coarse_weights = weights * math.sqrt(past.size / coarse_past.size)
+    few, few_past = of_moments(views, times, _MOTION_MOMENTS)
+    coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
     if motion is None:
-        left = unseen_residuals(coarse, coarse_past, coarse_weights, go_on, stop)
-        motion = left is not None and left[1] < _MOVES * left[0]
+        squares = unseen_squares(coarse, OfMoments(energies, past, weights), go_on, stop)
+        motion = squares is not None and beyond_chance(squares[0] - squares[1], _SURE)
+        left = None if squares is None else (math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean()))
     if motion:
-        learnt = learnt_motion(coarse, coarse_past, coarse_weights, go_on, stop)
+        learnt = learnt_motion(coarse, go_on, stop)
         learnt = learnt and learnt.on(learnt.shape, past)
     smooth = None if learnt is not None else _smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
