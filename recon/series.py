@@ -28,7 +28,7 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
 _SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
-_FACTORS = 0.95  # of the squares that volumes leave of views held out: factors that leave less are there
+_LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
@@ -161,7 +161,7 @@ def fit_series(
     coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
     if motion is None:
         squares = unseen_squares(coarse, OfMoments(energies, past, weights), go_on, stop)
-        motion = squares is not None and beyond_chance(squares[0] - squares[1], _SURE)
+        motion = squares is not None and _moves(*squares)
         left = None if squares is None else (math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean()))
     if motion:
         learnt = learnt_motion(coarse, go_on, stop)
@@ -186,6 +186,11 @@ def fit_series(
     fit.stop = lambda: False
     changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
     return TimedVolumes(times, changed, grid, fit.residual_of(changed), learnt, left, smooth)
+
+
+def _moves(still: F64, moved: F64) -> bool:
+    """By squares [block] that volumes without and with motion leave of views held out."""
+    return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
@@ -235,7 +240,7 @@ def _smooth_factors(
     if not steps.going or stop():
         return None
     alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free])).sum()
-    return smooth if left < _FACTORS * alone else None
+    return smooth if left < _LESS * alone else None
 
 
 def refuse_few(knots: int, n: int) -> None:

@@ -259,7 +259,7 @@ def _chosen(still: float, moved: float, moves: bool) -> str:
     said = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
     if moves or moved >= still:
         return said
-    return f"{said}, which is less, but within chance: if the sample moved, compare with --moves"
+    return f"{said}, which is less, but too little to be sure: if the sample moved, compare with --moves"
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
