@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews
-from recon.voxels.held_out_weight import ONE_IN
-from recon.voxels.motion import Motion, Seen, improved
-from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.motion import Motion, Seen, improved, moved, weighed
+from recon.voxels.projector import Projector, projection_lines, volume_lines
 
 _COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
 _FINE = 96  # pixels across up to which the last level has a voxel a pixel; of more, one for two
@@ -25,6 +25,7 @@ SWEEPS_OF_TURN = 6  # of a turn, which go on from the last one
 _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
 JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
+_BLOCKS, _ONE_BLOCK_IN = 32, 4  # of the scan's time, and one of so many held out: eight
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
@@ -41,47 +42,82 @@ def motion_sweeps(cols: int) -> int:
     return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
 
 
-def unseen_residuals(
-    views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
-) -> tuple[float, float] | None:
-    """Residuals of views held out, of volumes that do not move and of volumes that do; None: stopped.
+class OfMoments(NamedTuple):
+    """Views of a sample that changes, as of some moments.
 
-    Of coarse voxels, each from seven of eight views. Arguments as of `learnt_motion`.
+    Attributes:
+        views: each `energy` is a moment, each material a knot of the densities.
+        times: [moment] within the scan, 0 ... 1.
+        weights: of total variation of the densities' components.
     """
-    held_out = views.parted(ONE_IN) == ONE_IN // 2
-    binning = max(1, round(views.geometry.detector_shape[1] / JUDGED))
-    seen, unseen = (views.select(np.flatnonzero(chosen), slice(None)) for chosen in (~held_out, held_out))
-    follow = 2 * JUDGED_SWEEPS
-    motion = learnt_motion(seen, times, weights, lambda sweep, residual: go_on(sweep - follow, residual), stop)
+
+    views: EnergyViews
+    times: F64
+    weights: F64
+
+
+def unseen_squares(
+    coarse: OfMoments, fine: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> F64 | None:
+    """What volumes that do not move, and volumes that do, leave of views held out: squares [2, block], over the mean
+    of the views' own; None: stopped.
+
+    Views that follow each other are held out in blocks. Where angles rise with time, volumes in time predict a single
+    view from those before and after it, even of a sample that moves. The motion is learnt from `coarse` moments of the
+    other views; volumes of coarse voxels are fitted to `fine` ones, within which the sample hardly moves.
+
+    Args:
+        coarse, fine: the same views.
+        go_on, stop: as of `learnt_motion`.
+    """
+    block = fine.views.energy * _BLOCKS // len(fine.views.cross_sections)
+    held_out = block % _ONE_BLOCK_IN == _ONE_BLOCK_IN // 2
+    used, follow = np.flatnonzero(~held_out), 2 * JUDGED_SWEEPS
+    seen = coarse._replace(views=coarse.views.select(used, slice(None)))
+    motion = learnt_motion(seen, lambda sweep, residual: go_on(sweep - follow, residual), stop)
     if motion is None:
         return None
-    seen, unseen = _binned(seen, binning), _binned(unseen, binning)
-    grid, left = Grid.matching(seen.geometry), []
+    views = _binned(fine.views, round(fine.views.geometry.detector_shape[1] / JUDGED))
+    grid, left = Grid.matching(views.geometry), []
     nz, ny, nx = grid.shape
-    for now in (None, motion.on((ny, nx, nz), times)):
-        fit = EnergyFit(seen, grid, np.random.default_rng(0), now, stop)
-        for residual in fit.sweeps(weights, JUDGED_SWEEPS):
+    for now in (None, motion.on((ny, nx, nz), fine.times)):
+        fit = EnergyFit(views.select(used, slice(None)), grid, np.random.default_rng(0), now, stop)
+        for residual in fit.sweeps(fine.weights, JUDGED_SWEEPS):
             follow -= 1
             if not go_on(-follow, residual):
                 return None
         if stop():
             return None
-        left.append(EnergyFit(unseen, grid, np.random.default_rng(0), now).residual_of(fit.densities()))
-    return left[0], left[1]
+        left.append(_squares_left(views, fit.densities(), now, grid))
+    numbers = np.unique(block[held_out])
+    of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in left])
+    own = _squares_left(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
+    return of_blocks / (own or 1.0)
+
+
+def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
+    """[view] weighed squares of what densities [knot, z, y, x] leave."""
+    projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
+    weight = None if views.weight is None else projection_lines(views.weight)
+    squares = np.empty(len(data))
+    for view, moment in enumerate(views.energy.tolist()):
+        now = volume_lines(np.tensordot(views.cross_sections[moment].astype(np.float32), densities, 1))
+        image = projector.subset([view]).forward_lines(moved(now, None if motion is None else motion.at(moment)))
+        off = data[view : view + 1] - image
+        squares[view] = np.vdot(off, weighed(off, None if weight is None else weight[view : view + 1]))
+    return squares
 
 
 def learnt_motion(
-    views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+    of_moments: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> Motion | None:
     """The motion on the voxels of `Grid.matching`; None: stopped.
 
     Args:
-        views: each `energy` is a moment, each material a knot of the densities.
-        times: [moment], 0 ... 1.
-        weights: of total variation of the densities' components.
         go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
         stop: asked many times within a sweep; True ends it.
     """
+    views, times, weights = of_moments
     cols = views.geometry.detector_shape[1]
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
     motion, follow = None, motion_sweeps(cols)

@@ -18,17 +18,17 @@ from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import learnt_motion, unseen_residuals
+from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
-from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
+from recon.voxels.held_out_weight import ONE_IN, beyond_chance, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
-_MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
-_MOVES = 0.9  # of what volumes leave of views held out: a motion that leaves less is there
-_FACTORS = 0.95  # likewise of its square: factors that leave less are there
+_MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
+_SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
+_LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
@@ -157,13 +157,14 @@ def fit_series(
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
     learnt, left = None, None
-    coarse, coarse_past = of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
-    coarse_weights = weights * math.sqrt(past.size / coarse_past.size)
+    few, few_past = of_moments(views, times, _MOTION_MOMENTS)
+    coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
     if motion is None:
-        left = unseen_residuals(coarse, coarse_past, coarse_weights, go_on, stop)
-        motion = left is not None and left[1] < _MOVES * left[0]
+        squares = unseen_squares(coarse, OfMoments(energies, past, weights), go_on, stop)
+        motion = squares is not None and _moves(*squares)
+        left = None if squares is None else (math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean()))
     if motion:
-        learnt = learnt_motion(coarse, coarse_past, coarse_weights, go_on, stop)
+        learnt = learnt_motion(coarse, go_on, stop)
         learnt = learnt and learnt.on(learnt.shape, past)
     smooth = None if learnt is not None else _smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
@@ -185,6 +186,11 @@ def fit_series(
     fit.stop = lambda: False
     changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
     return TimedVolumes(times, changed, grid, fit.residual_of(changed), learnt, left, smooth)
+
+
+def _moves(still: F64, moved: F64) -> bool:
+    """By squares [block] that volumes without and with motion leave of views held out."""
+    return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
@@ -234,7 +240,7 @@ def _smooth_factors(
     if not steps.going or stop():
         return None
     alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free])).sum()
-    return smooth if left < _FACTORS * alone else None
+    return smooth if left < _LESS * alone else None
 
 
 def refuse_few(knots: int, n: int) -> None:

@@ -255,15 +255,11 @@ def reconstruct_series(
 
 
 def _chosen(still: float, moved: float, moves: bool) -> str:
-    """How views held out chose whether matter moves, and what to try where they can hardly tell.
-
-    In a scan by rising angles, volumes in time predict a view from those before and after it, even of a sample that
-    moves; so these two may be nearly level although the volumes are not.
-    """
+    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
     said = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
     if moves or moved >= still:
         return said
-    return f"{said}, which is less, but not by a tenth: if the sample moved, compare with --moves"
+    return f"{said}, which is less, but too little to be sure: if the sample moved, compare with --moves"
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
