@@ -129,7 +129,7 @@ def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
     """The content of the file that `open_below` opens, of so many bytes at most."""
     with open_below(folder, name, largest) as file:
-        return file.read(largest)
+        return file.read(min(largest, os.fstat(file.fileno()).st_size))
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:

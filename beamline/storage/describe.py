@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,15 @@ import numpy as np
 
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.wrapped import BriefSource
 from beamline.storage.rules.validate import altered_said, source_findings
 from beamline.storage.volumes.files import times_of, volume_format
 from beamline.storage.writer_lock import held
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from drivers.base.frame import FrameKind
+
+LOOK = 15.0
+"""Seconds in which frames are looked at for faults."""
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
@@ -51,7 +56,7 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
     }
 
 
-def describe_source(source: ScanSource) -> Mapping[str, Any]:
+def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
 
     Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
@@ -59,7 +64,8 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
     `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
-    findings = source_findings(source)
+    until = clock() + LOOK
+    findings = source_findings(BriefSource(source, lambda: clock() > until))
     attributes = dict(source.attributes)
     if not source.finished and not held(source.path):
         attributes["status"] = "died"

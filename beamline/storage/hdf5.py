@@ -363,6 +363,14 @@ def piece_of(item: h5py.Dataset) -> int:
     return (math.prod(item.chunks) if item.chunks else 1) * int(item.dtype.itemsize)
 
 
+def bytes_unpacked(item: h5py.Dataset, frames: int = 0) -> int:
+    """Bytes that HDF5 unpacks for one frame of a dataset of three dimensions, the one numbered `frames` that of
+    frames."""
+    across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
+    pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
+    return math.prod(pieces) * math.prod(across) * int(item.dtype.itemsize)
+
+
 def _require_brief(item: h5py.Dataset, n_bytes: int, most: float = BRIEF) -> None:
     """DataError where so many bytes, or the piece of the file that HDF5 unpacks for them, are too many."""
     if (n := max(n_bytes, piece_of(item))) > most:

@@ -20,9 +20,8 @@ from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.header import require_npy
+from beamline.storage.readers.tiff import PACKED
 
-PACKED = 1e5
-"""No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
 """mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")

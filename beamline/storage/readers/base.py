@@ -99,6 +99,11 @@ class ScanSource(ABC):
         return None
 
     @property
+    def frame_bytes(self) -> int:
+        """Bytes that are unpacked to read a frame, or any row of it."""
+        return self.shape[0] * self.shape[1] * self.dtype.itemsize
+
+    @property
     def finished(self) -> bool:
         """No more frames will come. Ask before refresh(): refresh() then finds all frames."""
         return True
@@ -266,6 +271,10 @@ def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOL
             if source.dtype.kind == "f":
                 image[...] = np.nan
     return out
+
+
+class LookedEnoughError(DataError):
+    """Looking at frames would take too long; what was found before stands."""
 
 
 def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -153,6 +153,10 @@ class NXtomoSource(ScanSource):
         return n
 
     @property
+    def frame_bytes(self) -> int:
+        return hdf5.bytes_unpacked(self._places.data)
+
+    @property
     def finished(self) -> bool:
         if not self._ours:
             return True

@@ -31,6 +31,7 @@ __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions"
 
 _SHORT = "i1", "i2"  # signed types that cameras' counts do not fit
 _LOOKED_AT = 3  # frames of a kind, for counts that wrapped
+_PIXELS, _UNPACKED = 2**27, 2**30  # of a frame, and bytes of it in a file, of which all rows are looked at
 REGISTRY = (  # modules in this folder, asked in this order
     "tiff_series",
     "tiff_stack",
@@ -185,7 +186,9 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
-            yield read_known(source, rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))])
+            some = rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))]
+            every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // _UNPACKED)
+            yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 
 
 def _of_parts(earlier: Sequence[Path], last: ScanSource) -> ScanSource:

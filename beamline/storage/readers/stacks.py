@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.readers.turned import TurnedFrames
 from drivers.base.frame import FrameKind
 
 _LISTED = 10  # datasets of a file that an error names
@@ -89,6 +90,13 @@ class StacksSource(ScanSource):
                 hdf5.read_frames(stack.frames, indices[wanted] - first, rows, part)
                 out[wanted] = part
         return out
+
+    @property
+    def frame_bytes(self) -> int:
+        stored = [stack.frames for stack in self._stacks]
+        known = [item.frame_bytes for item in stored if isinstance(item, TurnedFrames)]
+        known += [hdf5.bytes_unpacked(item) for item in stored if isinstance(item, h5py.Dataset)]
+        return max(known, default=super().frame_bytes)
 
     def close(self) -> None:
         self._file.close()

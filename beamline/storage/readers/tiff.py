@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import zipfile
 import zlib
@@ -17,6 +18,8 @@ from beamline.core.errors import DataError
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
+PACKED = 1e5
+"""No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
 UNREADABLE = (
     tifffile.TiffFileError,
     OSError,
@@ -52,9 +55,12 @@ def is_hidden(name: str) -> bool:
     return name.rpartition("/")[2].startswith(".")
 
 
-def read_image(file: Path | BinaryIO) -> NDArray[Any]:
-    """All pages of a TIFF; [row, col] for one page."""
+def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
+    """All pages of a TIFF; [row, col] for one page. ValueError where it claims more bytes, or more than it can hold."""
     with tifffile.TiffFile(file) as tif:
+        claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
+        if claimed > min(most, PACKED * stored):
+            raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
         return np.asarray(tif.asarray(key=slice(None)) if pages_one_by_one(tif) else tif.asarray())
 
 

@@ -7,20 +7,22 @@ the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
 
 from __future__ import annotations
 
+import errno
 import io
 import re
 import zipfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tifffile import TiffFile, natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.core.files import decoded
-from beamline.core.text import spans
+from beamline.core.files import TEXT, decoded
+from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
@@ -30,16 +32,15 @@ from beamline.storage.writers.ending import Ending
 from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
+LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
+_LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
 class TiffSeriesSource(ScanSource):
-    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
-
-    Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.
-    """
+    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series."""
 
     format = "tiff_series"
 
@@ -52,7 +53,7 @@ class TiffSeriesSource(ScanSource):
             kinds = kinds_of(path, images)
             series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
             _check_one_series(path, series)
-            with suppress(*UNREADABLE), TiffFile(io.BytesIO(self._bytes(series[0]))) as tif:  # damage is told below
+            with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
             in_names = angles_of(series)
             if in_names is not None:  # their angle does not say their order
@@ -68,11 +69,11 @@ class TiffSeriesSource(ScanSource):
             if in_names is not None:
                 self.angles[len(order) :] = in_names
             self.exposures = np.full(len(self._files), np.nan)
-            samples = [*self._readable(order), *self._readable(series[:_TRIED], at_least=1)[:1]]
+            some = order[:: len(order) // _REFERENCES + 1]
+            samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1].shape[0], samples[-1].shape[1]
             self.dtype = np.result_type(*(image.dtype for image in samples))
-            texts = [name for name in names if ANGLE_FILE.search(name.lower())]
-            self.angle_text = (texts[0], self._text(texts[0])) if len(texts) == 1 else None
+            self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         except BaseException:
             self.close()
             raise
@@ -81,12 +82,17 @@ class TiffSeriesSource(ScanSource):
         gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
         self._missing = tuple(before + number for number in left_out)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
-        if in_names is not None and self.angle_text is None:
+        if in_names is not None and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
 
     @property
     def ending(self) -> Ending:
         return Ending(missing=self._missing)
+
+    @property
+    def angle_text(self) -> tuple[str, str] | None:
+        """Name and content of the one file that is named after angles, or None. DataError: it is too large for them."""
+        return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)
@@ -119,16 +125,41 @@ class TiffSeriesSource(ScanSource):
                 names.append(item.relative_to(self.path).as_posix())
         return names
 
-    def _bytes(self, name: str) -> bytes:
+    def _bytes(self, name: str, most: int) -> bytes:
         try:
-            return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
+            with self._opened(name, most) as file:
+                return file.read(min(most, self._size(name)))
         except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
+    def _size(self, name: str) -> int:
+        return (self.path / name).stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
+
+    def _opened(self, name: str, most: int) -> IO[bytes]:
+        """A file of the series, of so many bytes at most."""
+        if (n := self._size(name)) > most:
+            raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
+        return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
+
+    @contextmanager
+    def _tiff(self, name: str) -> Iterator[TiffFile]:
+        """The head of an image, whose pixels are not read."""
+        try:
+            with self._opened(name, LARGEST_IMAGE) as file, TiffFile(file) as tif:
+                yield tif
+        except (*UNREADABLE, RuntimeError) as error:
+            raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+
     def _readable(self, names: list[str], at_least: int = 0) -> list[NDArray[Any]]:
-        """The images of these files that can be read; DataError where they are fewer than `at_least`."""
-        images, failed = list[NDArray[Any]](), list[UnreadableError]()
+        """The images of these files that can be read; DataError where they are fewer than `at_least`.
+
+        Of many bytes the first ones: to tell their type takes no more.
+        """
+        images, failed, looked = list[NDArray[Any]](), list[UnreadableError](), 0
         for name in names:
+            if images and looked > _LOOKED:
+                break
+            looked += self._size(name)
             try:
                 images.append(self._image(name))
             except UnreadableError as error:
@@ -138,16 +169,16 @@ class TiffSeriesSource(ScanSource):
         return images
 
     def _text(self, name: str) -> str:
-        content = self._bytes(name)
+        content = self._bytes(name, TEXT)
         try:
             return decoded(content)
         except UnicodeDecodeError:
             return content.decode("utf-8", "replace")  # a comment in another alphabet; numbers are told later
 
     def _image(self, name: str) -> NDArray[Any]:
-        content = self._bytes(name)
+        content = self._bytes(name, LARGEST_IMAGE)
         try:
-            image = read_image(io.BytesIO(content))
+            image = read_image(io.BytesIO(content), LARGEST_IMAGE)
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
         if image.size == 0:

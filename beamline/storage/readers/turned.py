@@ -9,6 +9,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.storage.hdf5 import bytes_unpacked
+
 
 class TurnedFrames:
     """A dataset of three dimensions, read as [frame, row, col]."""
@@ -18,6 +20,11 @@ class TurnedFrames:
         self._item, self._order = item, order
         self.shape = tuple(item.shape[axis] for axis in order)
         self.dtype, self.ndim, self.name, self.file = item.dtype, 3, item.name, item.file
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes that are unpacked to read a frame."""
+        return bytes_unpacked(self._item, self._order[0])
 
     def __len__(self) -> int:
         return int(self.shape[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame
+
+_UNPACKED, _READ = 2**31, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
 class WrappedSource(ScanSource):
@@ -49,6 +51,26 @@ class WrappedSource(ScanSource):
 for _name, _value in vars(ScanSource).items():  # all that may change, also what is added to it
     if isinstance(_value, property):
         setattr(WrappedSource, _name, property(attrgetter(f"_base.{_name}")))
+
+
+class BriefSource(WrappedSource):
+    """All of `base`, for who only describes it: LookedEnoughError, if `over` says so before a read, or for a read of
+    more than a moment's time and memory. The order of dimensions or the chunks of a file can make any frame cost all
+    of it."""
+
+    def __init__(self, base: ScanSource, over: Callable[[], bool]) -> None:
+        super().__init__(base)
+        self._over = over
+        self._update()
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        n = frame_indices(frames, int(self.image_key.size)).size * len(range(self.shape[0])[rows])
+        if self._over() or self.frame_bytes > _UNPACKED or n * self.shape[1] * self.dtype.itemsize > _READ:
+            raise LookedEnoughError(
+                "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
+                "validate` looks at them."
+            )
+        return self._base.read(frames, rows)
 
 
 class CroppedSource(WrappedSource):

@@ -19,7 +19,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
-from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.base import LookedEnoughError, ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding, Severity
 from beamline.storage.rules.flags import frames_flagged
@@ -88,9 +88,13 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 def source_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan, what is wrong with its references, and what is flagged."""
-    return [
-        *scan_findings(source), *scan_ended(source), *references_usable(source), *frames_flagged(source),
-    ]  # fmt: skip
+    found = list[Finding]()
+    for rule in (*SOURCE_RULES, scan_ended, references_usable, frames_flagged):
+        try:
+            found += rule(source)
+        except LookedEnoughError as error:
+            found.append(Finding("warning", "brief", str(error)))
+    return [*dict.fromkeys(found)]
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
