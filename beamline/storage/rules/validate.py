@@ -21,7 +21,8 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import LookedEnoughError, ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.finding import Finding, Severity
+from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
+from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
@@ -29,19 +30,11 @@ from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_degrees, look_like_transmission
+from recon.base.units import look_like_counts, look_like_transmission
 
 __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
-
-_FARTHEST = 1e6  # degrees
-_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
-_SAME = 0.1  # of the mean step: views so close are one
-_FALSE_ALARM = 1e-3  # of scans whose views are at random
-_OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
-_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
-_FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
@@ -167,111 +160,6 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
     n = int((source.image_key == FrameKind.PROJECTION).sum())
     if n < 2:
         yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
-
-
-def angles_known(source: ScanSource) -> Iterator[Finding]:
-    """Every projection has a finite angle."""
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    unknown = views[~np.isfinite(source.angles[views])]
-    if unknown.size:
-        why = source.attributes.get("angles", "")
-        yield Finding(
-            "error",
-            "angles",
-            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
-            + (f"; {why}" if why else "")
-            + ". Give them with --angles FILE (degrees, one a line).",
-        )
-
-
-def angles_spread(source: ScanSource) -> Iterator[Finding]:
-    """The projections look from different directions, over half a turn, and their angles can be degrees."""
-    angles = source.angles[source.image_key == FrameKind.PROJECTION]
-    if angles.size < 2 or not np.isfinite(angles).all():
-        return
-    farthest = float(np.abs(angles).max()) * 180 / np.pi
-    if farthest > _FARTHEST:
-        yield Finding(
-            "error",
-            "angle-spread",
-            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which "
-            "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
-        )
-        return
-    degrees = np.degrees(angles)
-    span = float(np.ptp(degrees))
-    distinct = np.unique(np.round(degrees, 6))
-    if distinct.size == 1:
-        yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
-        return
-    step = span / (distinct.size - 1)
-    # A plan is of our own scans, whose angles are in degrees.
-    severity: Severity = "warning" if source.plan else "error"
-    between = float(np.median(np.abs(np.diff(degrees))))
-    if look_like_degrees(angles):
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: these look "
-            "like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a line).",
-        )
-    elif between >= 360:
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"The projections go from {degrees.min():.6g} to {degrees.max():.6g} degrees, {between:.4g} from one to "
-            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
-            "degrees with --angles FILE (one a line); if they are right, give them less whole turns.",
-        )
-    elif (unit := _smaller_unit(distinct, angles.size)) is not None:
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
-            "(one a line).",
-        )
-    elif (unseen := half_turn_unseen(angles)) > 0:
-        said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
-        yield Finding(
-            "warning",
-            "angle-spread",
-            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
-        )
-
-
-def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
-
-    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
-    distributed length, whose mean is that of all gaps (Rényi 1953): of a thousandth (of ten views: a hundredth) by more
-    than is allowed for. Views in
-    even steps have gaps alike, and half a degree more is told.
-    """
-    places = np.sort(np.mod(np.degrees(angles), 180.0))
-    gaps = np.diff(places, append=places[0] + 180.0)
-    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
-    if gaps.size < 2:
-        return 180.0
-    *others, second, largest = np.sort(gaps)
-    uneven = float(np.std([*others, second])) / _OF_MEAN
-    n = len(others) + 1
-    times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
-    limit = second + max(_GAP, times * uneven)
-    if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
-        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
-    return float(largest) if largest > limit else 0.0
-
-
-def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
-    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
-    span = float(degrees[-1] - degrees[0])
-    whole = span + span / (degrees.size - 1)
-    for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
-        for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
-            if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
-                return f"these look like {unit}, of which {part:.5g} are {name}."
-    return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
@@ -475,6 +363,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     enough_views,
     angles_known,
     angles_spread,
+    angles_seen,
     quantity_said,
     references_present,
     exposures_agree,

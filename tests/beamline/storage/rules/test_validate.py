@@ -18,7 +18,8 @@ from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.rules.validate import angles_spread, change_of_rows, half_turn_unseen, source_findings, validate
+from beamline.storage.rules.angles import angles_spread, half_turn_unseen
+from beamline.storage.rules.validate import change_of_rows, source_findings, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal

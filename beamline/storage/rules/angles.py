@@ -1,0 +1,339 @@
+"""Angles: every view has one, together they go round half a turn, and the views show the turns that they state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding, Severity
+from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups, some_of
+from beamline.storage.rules.unlit import ViewLight
+from drivers.base.frame import FrameKind
+from recon.base.units import look_like_degrees
+
+_FARTHEST = 1e6  # degrees
+_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
+_SAME = 0.1  # of the mean step: views so close are one
+_FALSE_ALARM = 1e-3  # of scans whose views are at random
+_OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
+_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
+_PAIRS = 6  # of views that are stated half a turn apart, which are compared
+_UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
+_FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
+_AROUND = 9  # views about the best of some that are looked at
+_EDGE = 16  # one column in so many, at each edge, is taken for air
+_STEADY = 0.05  # of the mass of the sample in the field: what goes in and out has no centre
+_FAR = 0.01  # of the field, by which the centre of mass must be off
+_PARTS = 4  # of a column, by which mirror images are moved
+_LEAST_LIGHT = 1e-3  # of the beam
+_FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
+
+
+def angles_known(source: ScanSource) -> Iterator[Finding]:
+    """Every projection has a finite angle."""
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    unknown = views[~np.isfinite(source.angles[views])]
+    if unknown.size:
+        why = source.attributes.get("angles", "")
+        yield Finding(
+            "error",
+            "angles",
+            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
+            + (f"; {why}" if why else "")
+            + ". Give them with --angles FILE (degrees, one a line).",
+        )
+
+
+def angles_spread(source: ScanSource) -> Iterator[Finding]:
+    """The projections look from different directions, over half a turn, and their angles can be degrees."""
+    angles = source.angles[source.image_key == FrameKind.PROJECTION]
+    if angles.size < 2 or not np.isfinite(angles).all():
+        return
+    farthest = float(np.abs(angles).max()) * 180 / np.pi
+    if farthest > _FARTHEST:
+        yield Finding(
+            "error",
+            "angle-spread",
+            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which "
+            "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
+        )
+        return
+    degrees = np.degrees(angles)
+    span = float(np.ptp(degrees))
+    distinct = np.unique(np.round(degrees, 6))
+    if distinct.size == 1:
+        yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
+        return
+    step = span / (distinct.size - 1)
+    # A plan is of our own scans, whose angles are in degrees.
+    severity: Severity = "warning" if source.plan else "error"
+    between = float(np.median(np.abs(np.diff(degrees))))
+    if look_like_degrees(angles):
+        yield Finding(
+            severity,
+            "angle-spread",
+            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: these look "
+            "like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a line).",
+        )
+    elif between >= 360:
+        yield Finding(
+            severity,
+            "angle-spread",
+            f"The projections go from {degrees.min():.6g} to {degrees.max():.6g} degrees, {between:.4g} from one to "
+            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
+            "degrees with --angles FILE (one a line); if they are right, give them less whole turns.",
+        )
+    elif (unit := _smaller_unit(distinct, angles.size)) is not None:
+        yield Finding(
+            severity,
+            "angle-spread",
+            f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
+            "(one a line).",
+        )
+    elif (unseen := half_turn_unseen(angles)) > 0:
+        said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view."
+            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
+        )
+
+
+def half_turn_unseen(angles: NDArray[np.float64]) -> float:
+    """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
+
+    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
+    distributed length, whose mean is that of all gaps (Rényi 1953): of a thousandth (of ten views: a hundredth) by more
+    than is allowed for. Views in
+    even steps have gaps alike, and half a degree more is told.
+    """
+    places = np.sort(np.mod(np.degrees(angles), 180.0))
+    gaps = np.diff(places, append=places[0] + 180.0)
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
+    if gaps.size < 2:
+        return 180.0
+    *others, second, largest = np.sort(gaps)
+    uneven = float(np.std([*others, second])) / _OF_MEAN
+    n = len(others) + 1
+    times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
+    limit = second + max(_GAP, times * uneven)
+    if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
+    return float(largest) if largest > limit else 0.0
+
+
+def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
+    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
+    span = float(degrees[-1] - degrees[0])
+    whole = span + span / (degrees.size - 1)
+    for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
+        for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
+            if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
+                return f"these look like {unit}, of which {part:.5g} are {name}."
+    return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Coarse line integrals of some views of a scan, each read once."""
+
+    source: ScanSource
+    light: ViewLight
+
+    def depth(self, row: int) -> NDArray[np.float64]:
+        """[row, col] of a view."""
+        cells = reference_frame(self.source, row).cells
+        assert cells is not None
+        if self.light.dark is None or self.light.flat is None:
+            return np.nan_to_num(cells.astype(np.float64))
+        beam = np.nan_to_num(self.light.flat - self.light.dark)
+        least = _LEAST_LIGHT * max(float(beam.max()), 1e-30)
+        seen = np.nan_to_num(cells - self.light.dark)
+        return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
+
+    def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool) -> float:
+        """1 less the correlation of pairs of views; of mirror images about the one column that fits them best."""
+        cols = self.depth(pairs[0][0]).shape[1]
+        moves = np.arange(-(cols // 4) * _PARTS, cols // 4 * _PARTS + 1) / _PARTS if mirrored else np.zeros(1)
+        curve = np.zeros(len(moves))
+        for one, other in pairs:
+            a, b = self.depth(one), self.depth(other)[:, :: -1 if mirrored else 1]
+            a, b = ((each[:, :-2] + 2 * each[:, 1:-1] + each[:, 2:]) / 4 for each in (a, b))
+            curve += [1 - _correlation(*_laid_on(a, b, move)) for move in moves.tolist()]
+        return float(curve.min()) / len(pairs)
+
+
+def angles_seen(source: ScanSource) -> Iterator[Finding]:
+    """Views that are stated half a turn apart are mirror images (a whole turn: alike), and no others are.
+
+    Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
+    sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
+    does: a round sample shows no angle.
+    """
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    kinds = set(source.image_key.tolist())
+    counts = source.quantity == "counts"
+    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+        return
+    if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
+        return
+    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
+    views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
+    views = views[np.argsort(source.angles[views], kind="stable")]
+    seen = _Views(source, light)
+    some = some_of(views, VIEWS)
+    some = some[[bool(np.ptp(seen.depth(row))) for row in some.tolist()]]
+    degrees = np.degrees(source.angles)
+    if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
+        return
+    apart = max(np.ptp(degrees[some]) / _FINE, float(np.median(np.diff(np.unique(degrees[views])))))
+    beside = views[np.abs(degrees[views] - degrees[some][:, None] - apart).argmin(axis=1)]
+    chosen = np.flatnonzero(beside != some)
+    if not chosen.size:
+        return
+    chosen = chosen[np.unique(np.linspace(0, chosen.size - 1, _PAIRS).astype(int))]
+    near = float(np.median([seen.unlike([(int(some[at]), int(beside[at]))], False) for at in chosen]))
+    for mirrored in (True, False) if source.cone is None else (False,):
+        turn = _turn_seen(seen, views, some, degrees, near, mirrored)
+        if turn is not None:
+            yield _angles_finding(source, degrees[views], turn, mirrored)
+            return
+    if source.cone is None and (scale := _scale_by_mass(seen, some)) is not None:
+        counted = _counted(degrees[views])
+        yield Finding(
+            "error" if counted and not source.plan else "warning",
+            "angle-spread",
+            f"The centre of mass of the views goes round {scale:.3g} times as fast as the stated angles say"
+            + (_COUNTED if counted else ". Are they in degrees?")
+            + " Give them in degrees with --angles FILE (one a line).",
+        )
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Two frames that look half a turn apart (or a whole turn), and two that are stated to be; None: none are."""
+
+    alike: tuple[int, int]
+    degrees: float
+    stated: tuple[int, int] | None
+
+
+def _turn_seen(
+    seen: _Views, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], near: float,
+    mirrored: bool,
+) -> _Turn | None:  # fmt: skip
+    """Views that are alike after another angle than they should be, where those that should be are not.
+
+    Args:
+        views, some: all, and some of them, by ascending angle.
+        near: how much neighbours of these some differ.
+    """
+    period, step = (180.0 if mirrored else 360.0), float(np.ptp(degrees[some])) / (some.size - 1)
+    partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
+    own = float(np.median(np.diff(np.unique(degrees[views]))))
+    pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= min(own, step))
+    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
+    stated = [(int(some[at]), int(partner[at])) for at in pairs]
+    off = seen.unlike(stated, mirrored) if stated else np.inf
+    if off < 2 * _UNLIKE * near or (not stated and not mirrored):
+        return None
+    first, last = int(some[0]), int(some[-1])
+    ends = [(first, row) for row in some[some.size // 4 :].tolist()] + [
+        (row, last) for row in some[1 : -(some.size // 4)].tolist()
+    ]
+    found = [seen.unlike([pair], mirrored) for pair in ends]
+    usual, (one, other) = float(np.median(found)), ends[int(np.argmin(found))]
+    fixed, moved = (one, other) if one == first else (other, one)
+    around = views[np.abs(degrees[views] - degrees[moved]) < step]
+    best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
+    turned = abs(float(degrees[nearest] - degrees[fixed]))
+    if abs(turned - period) <= step or not best < min(2 * near, off / _UNLIKE, usual / _UNLIKE):
+        return None
+    return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
+
+
+def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:
+    half, whole = ("half a turn", 180.0) if mirrored else ("a turn", 360.0)
+    counted = _counted(degrees)
+    gradians = abs(turn.degrees / (whole / 0.9) - 1) < np.ptp(degrees) / VIEWS / turn.degrees
+    unit = (
+        "they are 0, 1, 2 and so on, and count the views"
+        if counted
+        else f"they look like gradians, of which {whole / 0.9:g} are {half}"
+        if gradians
+        else f"they look {whole / turn.degrees:.3g} times as large as stated"
+    )
+    said = (
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are {'mirror images' if mirrored else 'alike'}, as views {half} "
+        f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
+    )
+    if turn.stated is not None:
+        said += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
+    # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
+    # symmetric may look so, too.
+    sure = not source.plan and (turn.stated is not None or counted)
+    return Finding(
+        "error" if sure else "warning",
+        "angle-spread",
+        f"{said}. The angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+    )
+
+
+def _counted(degrees: NDArray[np.float64]) -> bool:
+    return bool(np.allclose(np.sort(degrees), np.arange(degrees.size)))
+
+
+def _scale_by_mass(seen: _Views, some: NDArray[np.int64]) -> float | None:
+    """How many times as fast as the angles the centre of mass goes round; None where they fit, or it does not tell.
+
+    The mass of a sample is the same in all views, and its centre is at a sine of the angle (Helgason 1965, Ludwig
+    1966: the moments of orders 0 and 1). A creeping sample has no sine: so the stated angles must fail by a hundredth
+    of the field, and others must fit four times as well.
+    """
+    depth = np.array([seen.depth(row) for row in some.tolist()])
+    n = max(1, depth.shape[2] // _EDGE)
+    air = (depth[:, :, :n].mean(axis=2) + depth[:, :, -n:].mean(axis=2)) / 2
+    depth -= air[:, :, None]
+    mass = depth.mean(axis=(1, 2))
+    if not mass.std() < _STEADY * mass.mean():
+        return None
+    places = np.linspace(0, 1, depth.shape[2])
+    centre = (depth * places).mean(axis=(1, 2)) / mass
+    angles = seen.source.angles[some] - seen.source.angles[some[0]]
+
+    def left(scale: float) -> float:
+        sines = np.stack([np.ones_like(angles), np.cos(scale * angles), np.sin(scale * angles)], axis=1)
+        return float(np.std(centre - sines @ np.linalg.lstsq(sines, centre, rcond=None)[0]))
+
+    scales = np.geomspace(0.2, 5, 200)
+    lefts = [left(scale) for scale in scales]
+    best = int(np.argmin(lefts))
+    return float(scales[best]) if left(1.0) > max(_FAR, _UNLIKE * lefts[best]) else None
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Of two images, each row less its mean; 0 where there is nothing."""
+    a, b = (each - each.mean(axis=1, keepdims=True) for each in (a, b))
+    power = float((a * a).sum()) * float((b * b).sum())
+    return float((a * b).sum()) / power**0.5 if power > 0 else 0.0
+
+
+def _laid_on(
+    a: NDArray[np.float64], b: NDArray[np.float64], move: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The columns that both have where b lies so many columns to the left; both take half of a fraction."""
+    whole = math.floor(move)
+    half = (move - whole) / 2
+    if half:
+        a = (1 - half) * a[:, :-1] + half * a[:, 1:]
+        b = half * b[:, :-1] + (1 - half) * b[:, 1:]
+        whole += 1
+    cols = a.shape[1]
+    return a[:, max(whole, 0) : cols + min(whole, 0)], b[:, max(-whole, 0) : cols - max(whole, 0)]

@@ -1,0 +1,78 @@
+"""Angles that are not those of the views: gradians, positions in a list, twice or half of the truth.
+
+Scans of balls by the formula of a sphere's chord; one sample is wider than the field, one is round.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.storage.rules.angles import angles_seen
+from beamline.storage.rules.finding import Finding
+from tests.beamline.array_source import ArraySource
+
+ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
+Balls = list[tuple[float, float, float, float]]  # x, y, radius in px, and attenuation a px
+WITHIN: Balls = [(0, 0, 32, 0.004), (14, 6, 8, 0.03), (-12, 10, 7, 0.02), (-9, -15, 6, 0.06)]
+WIDER: Balls = [(0, 0, 70, 0.004), (20, 10, 12, 0.03), (-30, 12, 9, 0.02), (25, -34, 8, 0.03)]
+ROUND: Balls = [(0, 0, 32, 0.02)]
+
+
+def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], axis: float = 44.3) -> ArraySource:
+    """Counts of views at these true angles in degrees under other labels."""
+    rng = np.random.default_rng(3)
+    row, col, angles = np.arange(ROWS) - (ROWS - 1) / 2, np.arange(COLS) - axis, np.radians(true)
+    depth = np.zeros((true.size, ROWS, COLS))
+    for x, y, radius, mu in balls:
+        at = (x * np.cos(angles) + y * np.sin(angles))[:, None, None]
+        depth += 2 * mu * np.sqrt((radius**2 - (col - at) ** 2 - (row[:, None] + y / 8) ** 2).clip(0))
+    beam = LIGHT * np.exp(-0.3 * np.linspace(-1, 1, COLS) ** 2)
+    counts = np.concatenate([np.zeros((4, ROWS, COLS)), np.tile(beam, (4, ROWS, 1)), beam * np.exp(-depth)])
+    keys = [2] * 4 + [1] * 4 + [0] * true.size
+    frames = rng.poisson(counts + DARK).astype(np.uint16)
+    return ArraySource(frames, keys, np.r_[np.full(8, np.nan), np.radians(stated)])
+
+
+def told(source: ArraySource) -> list[Finding]:
+    return list(angles_seen(source))  # type: ignore[arg-type]
+
+
+def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float64]:
+    return np.linspace(0, degrees, views, endpoint=endpoint)
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER], ids=["within", "wider"])
+@pytest.mark.parametrize(
+    ("true", "stated", "unit"),
+    [
+        (turn(180, 120), turn(200, 120), "they look like gradians, of which 200 are half a turn"),
+        (turn(360, 120, endpoint=True), turn(400, 120, endpoint=True), "they look like gradians"),
+        (turn(180, 240), np.arange(240.0), "they are 0, 1, 2 and so on, and count the views"),
+        (turn(180, 90), np.arange(90.0), "they are 0, 1, 2 and so on, and count the views"),
+        (turn(360, 120), turn(180, 120), "times as large as stated"),
+        (turn(180, 120), turn(360, 120), "times as large as stated"),
+    ],
+)
+def test_angles_of_another_unit_are_refused(
+    balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], unit: str
+) -> None:
+    (hit,) = told(scan(balls, true, stated))
+    assert (hit.severity, hit.rule) == ("error", "angle-spread")
+    assert unit in hit.message and "--angles FILE" in hit.message
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
+@pytest.mark.parametrize(
+    "true",
+    [turn(180, 90), turn(360, 90), turn(180, 181, endpoint=True), turn(120, 60), turn(200, 90),
+     np.arange(90) * 111.246 % 180, np.sort(np.random.default_rng(4).uniform(0, 360, 80))],
+    ids=["half", "whole", "0 to 180", "limited", "more", "golden", "random"],
+)  # fmt: skip
+def test_angles_that_the_views_show_are_not_doubted(balls: Balls, true: NDArray[np.float64]) -> None:
+    assert told(scan(balls, true, true)) == []
+
+
+def test_a_round_sample_shows_no_angle() -> None:
+    assert told(scan(ROUND, turn(180, 90), turn(200, 90))) == []
