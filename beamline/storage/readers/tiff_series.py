@@ -34,6 +34,7 @@ from drivers.base.frame import FrameKind
 MOST_FILES = 100_000
 LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
+_MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
@@ -78,7 +79,8 @@ class TiffSeriesSource(ScanSource):
             self.close()
             raise
         numbers = _numbers(series if in_names is None else [without_angle(name) for name in series])
-        left_out = [] if numbers is None else sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()})
+        counted = numbers is not None and np.ptp(numbers) < _MOST_NUMBERS  # dates and serial numbers count no images
+        left_out = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}) if counted else []
         gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
         self._missing = tuple(before + number for number in left_out)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
