@@ -42,6 +42,7 @@ LENGTH_UNITS = {  # mm
     "micron": 1e-3, "microns": 1e-3, "micrometer": 1e-3, "micrometre": 1e-3, "nm": 1e-6,
 }  # fmt: skip
 ENERGY_UNITS = {"ev": 1e-3, "kev": 1.0}  # keV
+WAVELENGTH_UNITS = {"angstrom": 1.0, "angstroms": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "pm": 0.01, "m": 1e10}  # Å
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6}  # s
 
 

@@ -109,13 +109,10 @@ def read_energy(entry: h5py.Group) -> float | None:
             if kev is not None:
                 return kev
         for where in groups_:
-            angstrom = _one(entry, f"{where}/{wavelength}", _WAVELENGTH_UNITS)
+            angstrom = _one(entry, f"{where}/{wavelength}", hdf5.WAVELENGTH_UNITS)
             if angstrom is not None and angstrom > 0:
                 return _HC / angstrom
     return None
-
-
-_WAVELENGTH_UNITS = {"angstrom": 1.0, "angstroms": 1.0, "å": 1.0, "a": 1.0, "nm": 10.0, "pm": 0.01, "m": 1e10}
 
 
 def _one(entry: h5py.Group, path: str, units: dict[str, float]) -> float | None:

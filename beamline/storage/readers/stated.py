@@ -140,6 +140,8 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 _POSES = "give the shifts of views with --poses"
 _POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"
 UPRIGHT = "the detector is taken to stand upright to the beam"
+_ENERGY = "energy, where the beams above state none"
+_WAVELENGTH = "energy, where no beam states one"
 _DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
 
 NXTOMO: tuple[Entry, ...] = (
@@ -186,10 +188,14 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("end_time", "shown"),
     Entry("instrument/name", "shown"),
     Entry("control/data", "ring current of each frame, or another monitor of the beam"),
-    Entry("instrument/beam/incident_energy", "energy; also in beam/ and sample/beam/", units=hdf5.ENERGY_UNITS),
-    Entry("instrument/beam/incident_wavelength", "energy, where no energy is stated; also in beam/ and sample/beam/"),
+    Entry("instrument/beam/incident_energy", "energy", units=hdf5.ENERGY_UNITS),
+    Entry("beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
+    Entry("sample/beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
+    Entry("instrument/beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
+    Entry("beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
+    Entry("sample/beam/incident_wavelength", _WAVELENGTH, units=hdf5.WAVELENGTH_UNITS),
     Entry("instrument/monochromator/energy", "energy, where the beam states none", units=hdf5.ENERGY_UNITS),
-    Entry("instrument/monochromator/wavelength", "energy, where no energy is stated"),
+    Entry("instrument/monochromator/wavelength", "energy, where nothing else states it", units=hdf5.WAVELENGTH_UNITS),
     Entry(
         "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
     ),

@@ -162,12 +162,16 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
     "end_time": ([("end_time", "2026", None)], lambda s: s.attributes["end_time"], "2026"),
     "instrument/name": ([("instrument/name", "bm05", None)], lambda s: s.attributes["instrument"], "bm05"),
     "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: s.currents.tolist()[6], 7),
-    "instrument/beam/incident_energy": (
-        [("instrument/beam/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25,
-    ),
-    "instrument/beam/incident_wavelength": (
-        [("instrument/beam/incident_wavelength", WAVELENGTH, "angstrom")], lambda s: s.energy_kev, 25,
-    ),
+    **{
+        f"{where}/incident_energy": ([(f"{where}/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25)
+        for where in ("instrument/beam", "beam", "sample/beam")
+    },
+    **{
+        f"{where}/incident_wavelength": (
+            [(f"{where}/incident_wavelength", WAVELENGTH, "angstrom")], lambda s: s.energy_kev, 25,
+        )
+        for where in ("instrument/beam", "beam", "sample/beam")
+    },
     "instrument/monochromator/energy": ([("instrument/monochromator/energy", 25, "keV")], lambda s: s.energy_kev, 25),
     "instrument/monochromator/wavelength": (
         [("instrument/monochromator/wavelength", WAVELENGTH / 10, "nm")], lambda s: s.energy_kev, 25,
