@@ -79,8 +79,9 @@ class TiffSeriesSource(ScanSource):
             self.close()
             raise
         numbers = _numbers(series if in_names is None else [without_angle(name) for name in series])
-        counted = numbers is not None and np.ptp(numbers) < _MOST_NUMBERS  # dates and serial numbers count no images
-        left_out = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}) if counted else []
+        if numbers is not None and np.ptp(numbers) >= _MOST_NUMBERS:
+            numbers = None  # dates and serial numbers count no images
+        left_out = [] if numbers is None else sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()})
         gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
         self._missing = tuple(before + number for number in left_out)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})

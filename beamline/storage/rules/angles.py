@@ -241,7 +241,8 @@ def _turn_seen(
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= min(own, step))
     pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
     stated = [(int(some[at]), int(partner[at])) for at in pairs]
-    off = seen.unlike(stated, mirrored) if stated else np.inf
+    # The most alike of them: a frame without light, or a crumb in it, makes one pair unlike, wrong angles make all.
+    off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
     if off < 2 * _UNLIKE * near or (not stated and not mirrored):
         return None
     first, last = int(some[0]), int(some[-1])
