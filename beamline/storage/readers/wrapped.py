@@ -15,7 +15,7 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
-_UNPACKED, _READ = 2**31, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+_UNPACKED, _READ = 2**30, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
 class WrappedSource(ScanSource):
