@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
@@ -77,6 +78,16 @@ def scan(tmp_path: Path, frames: list[Frame], clock: StandingClock) -> Iterator[
             return writer.path
 
         yield write
+
+
+def test_numbers_that_a_series_of_files_leaves_out_are_missing_in_its_copy(tmp_path: Path) -> None:
+    folder = tmp_path / "series"
+    folder.mkdir()
+    for name in ("dark_0001", "flat_0001", "view_0003", "view_0004", "view_0006"):
+        tifffile.imwrite(folder / f"{name}.tif", np.full(SHAPE, 7, np.uint16))
+    ingest(SourceOptions(folder, angles=np.array([0.0, 0.1, 0.3])), tmp_path / "copy.h5")
+    with open_scan(tmp_path / "copy.h5") as source:
+        assert source.ending == Ending(missing=(4,))
 
 
 @pytest.mark.parametrize("end", [*ENDINGS, "running"])
