@@ -19,7 +19,8 @@ from recon.voxels.pnp_dct import pnp_dct, towards_views
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
-F32, F64 = NDArray[np.float32], NDArray[np.float64]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 SIDE, FINE = 80, 4  # voxels, and rays a pixel
 
 
