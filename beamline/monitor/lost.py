@@ -39,7 +39,10 @@ class LostCheck:
         score = 1 - context.light_left
         if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
             return Look(state)
+        empty = "Every pixel has one value: the frame was never written, or the camera gave none. Look at the file."
         advice = (
             f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
+            if digest.variance
+            else empty
         )
         return Look(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))

@@ -23,7 +23,7 @@ from drivers.base.frame import Frame
 
 EVERY = math.radians(5)  # radians between kept views
 MOST = 36  # of them: half a turn
-BESIDE = 1.25  # steps from the angle sought to a view, at most
+BESIDE = 1.01  # steps from the angle sought to a view, at most; a hundredth is rounding
 REACH = 2.0  # cells that the rim may move within these: the kept view goes on by its velocity
 LATER = 8  # views after the kept one at least
 CELLS = (0.05, 0.5, 0.25)  # shares of a cell: least limits of a shift, of a remainder and of the axis

@@ -121,6 +121,12 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
             f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
         )
+    elif series is not None and n < angles.size != key.size:
+        lost = angles.size - n
+        message += (
+            f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
+            f"{angles.size}, the first {lost} or the last {lost} may be lost"
+        )
     if angles.size < n:
         return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
     message += f". Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"

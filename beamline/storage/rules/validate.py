@@ -25,7 +25,8 @@ from beamline.storage.rules.angles import angles_known, angles_seen, angles_spre
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
-from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.references import VIEWS, reference_groups, references_usable, some_of
+from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
@@ -67,6 +68,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
             return [*of_all]
         with open_scan(scan) as source:
             findings += source_findings(source)
+            findings += views_lit(source, deep is not None)
             findings += frames_as_written(source, deep)
     except DataError as error:
         if not any(finding.severity == "error" for finding in findings):  # else it is already said why
@@ -107,6 +109,27 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
     else:
         return
     yield Finding("warning", "unfinished", f"{said} {next_step(source.path)}".strip())
+
+
+def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
+    """Views have light: all of them, or some over the scan. `beamline recon` names and leaves out those without."""
+    counted = source.quantity == "counts"
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    kinds = {FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION}
+    if not counted or not kinds <= {*source.image_key.tolist()}:
+        return
+    looked_at = views if every else some_of(views, VIEWS)
+    light = ViewLight.of(source, reference_groups(source).good())
+    unlit = [row for row in looked_at.tolist() if light.unlit(row)]
+    if unlit:
+        of = f"{views.size} views" if every else f"{looked_at.size} views looked at"
+        more = "" if every else " `validate --deep` looks at all."
+        yield Finding(
+            "warning",
+            "unlit",
+            f"{len(unlit)} of {of} (frames {spans(unlit)}) have no light: the shutter was closed, the beam was gone, "
+            f"or the file was never written there. `beamline recon` leaves such views out.{more}",
+        )
 
 
 def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator[Finding]:

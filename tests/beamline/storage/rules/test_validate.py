@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from beamline.core.text import spans
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -467,3 +468,24 @@ def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantit
             np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], frames[-1])
     with open_scan(replace(upright, cols=(5, 30))) as source:
         np.testing.assert_array_equal(source.read(views[:2], slice(2, 4)), frames[:2, 2:4, 5:30])
+
+
+@pytest.mark.parametrize("unlit", [[8], [5, 6, 7]])
+def test_views_without_light_are_named(tmp_path: Path, unlit: list[int]) -> None:
+    rng = np.random.default_rng(2)
+    counts = np.concatenate([np.full((2, 8, 24), 100.0), np.full((2, 8, 24), 5e3), np.full((16, 8, 24), 3e3)])
+    frames = rng.poisson(counts).astype(np.uint16)
+    frames[[4 + view for view in unlit]] = 0
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data_dark"], file["exchange/data_white"], file["exchange/data"] = (
+            frames[:2],
+            frames[2:4],
+            frames[4:],
+        )
+        file["exchange/theta"] = np.arange(16) * 11.25
+    (hit,) = [hit for hit in validate(tmp_path / "s.h5") if hit.rule == "unlit"]
+    assert hit.severity == "warning"
+    assert (
+        f"{len(unlit)} of 16 views looked at (frames {spans([4 + view for view in unlit])}) have no light"
+        in hit.message
+    )
