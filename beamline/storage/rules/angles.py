@@ -26,6 +26,7 @@ _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 _PAIRS = 6  # of views that are stated half a turn apart, which are compared
 _UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
+_STEPS_OFF = 2  # steps of some views from a true half turn: nearer ones are alike although angles are right
 _AROUND = 9  # views about the best of some that are looked at
 _EDGE = 16  # one column in so many, at each edge, is taken for air
 _STEADY = 0.05  # of the mass of the sample in the field: what goes in and out has no centre
@@ -189,7 +190,7 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     views = views[np.argsort(source.angles[views], kind="stable")]
     seen = _Views(source, light)
     some = some_of(views, VIEWS)
-    some = some[[bool(np.ptp(seen.depth(row))) for row in some.tolist()]]
+    some = some[[bool(np.ptp(seen.depth(row))) and not light.unlit(row) for row in some.tolist()]]
     degrees = np.degrees(source.angles)
     if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
         return
@@ -240,7 +241,7 @@ def _turn_seen(
     own = float(np.median(np.diff(np.unique(degrees[views]))))
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= min(own, step))
     pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
-    stated = [(int(some[at]), int(partner[at])) for at in pairs]
+    stated = [(int(some[at]), int(partner[at])) for at in pairs if not seen.light.unlit(int(partner[at]))]
     # The most alike of them: a frame without light, or a crumb in it, makes one pair unlike, wrong angles make all.
     off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
     if off < 2 * _UNLIKE * near or (not stated and not mirrored):
@@ -255,7 +256,7 @@ def _turn_seen(
     around = views[np.abs(degrees[views] - degrees[moved]) < step]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
-    if abs(turned - period) <= step or not best < min(2 * near, off / _UNLIKE, usual / _UNLIKE):
+    if abs(turned - period) <= _STEPS_OFF * step or not best < min(2 * near, off / _UNLIKE, usual / _UNLIKE):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
