@@ -28,7 +28,7 @@ from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
 from recon.voxels.fbp import fbp_nanoseconds
 from recon.voxels.held_out_weight import CHOICE_SWEEPS, LEAST_VIEWS
-from recon.voxels.iterative import IterativeMethod
+from recon.voxels.iterative import IterativeMethod, PreparedMethod
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
@@ -104,7 +104,8 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
     candidates = candidates_of(method)
     if candidates[0] is method:
         if isinstance(method, IterativeMethod):
-            seconds = _of_iterations(method, extent, now, method.iterations)
+            trials = method.trial_sweeps if isinstance(method, PreparedMethod) else CHOICE_SWEEPS
+            seconds = _of_iterations(method, extent, now, method.iterations, trials)
         elif isinstance(method, FieldMethod):
             seconds = _of_field(method, extent, now)
         else:

@@ -43,10 +43,16 @@ class IterativeMethod(Protocol):
 
 @runtime_checkable
 class PreparedMethod(IterativeMethod, Protocol):
-    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations."""
+    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations.
+
+    `trial_sweeps`: sweeps of all of its trials, as a rule.
+    """
 
     @property
     def first_sweeps(self) -> int: ...
+
+    @property
+    def trial_sweeps(self) -> int: ...
 
 
 def solve(

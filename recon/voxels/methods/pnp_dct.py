@@ -11,7 +11,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out_weight import Trial, heaviest_in_octaves, is_coarse_cone, least_in_octaves
+from recon.voxels.held_out_weight import CHOICE_SWEEPS, Trial, heaviest_in_octaves, is_coarse_cone, least_in_octaves
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
@@ -47,6 +47,11 @@ class PnpDct:
     def first_sweeps(self) -> int:
         """Sweeps of FISTA-TV before the first step."""
         return FistaTv().iterations
+
+    @property
+    def trial_sweeps(self) -> int:
+        """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
+        return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * PnpDct().iterations
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)
