@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding, Severity
 from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups, some_of
-from beamline.storage.rules.unlit import ViewLight
+from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_degrees
 
@@ -23,10 +23,11 @@ _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
+_OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
+_FACTORS = 1 / 0.9, 2.0, 0.5  # of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses
 _PAIRS = 6  # of views that are stated half a turn apart, which are compared
 _UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
-_STEPS_OFF = 2  # steps of some views from a true half turn: nearer ones are alike although angles are right
 _AROUND = 9  # views about the best of some that are looked at
 _EDGE = 16  # one column in so many, at each edge, is taken for air
 _STEADY = 0.05  # of the mass of the sample in the field: what goes in and out has no centre
@@ -159,6 +160,13 @@ class _Views:
         seen = np.nan_to_num(cells - self.light.dark)
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
+    def lit(self, row: int) -> bool:
+        """The view has light, and shows something."""
+        known = reference_frame(self.source, row).cells
+        if known is None or self.light.dark is None or self.light.flat is None:
+            return bool(np.ptp(self.depth(row)))
+        return brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
+
     def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool) -> float:
         """1 less the correlation of pairs of views; of mirror images about the one column that fits them best."""
         cols = self.depth(pairs[0][0]).shape[1]
@@ -190,7 +198,7 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     views = views[np.argsort(source.angles[views], kind="stable")]
     seen = _Views(source, light)
     some = some_of(views, VIEWS)
-    some = some[[bool(np.ptp(seen.depth(row))) and not light.unlit(row) for row in some.tolist()]]
+    some = some[[seen.lit(row) for row in some.tolist()]]
     degrees = np.degrees(source.angles)
     if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
         return
@@ -241,8 +249,8 @@ def _turn_seen(
     own = float(np.median(np.diff(np.unique(degrees[views]))))
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= min(own, step))
     pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
-    stated = [(int(some[at]), int(partner[at])) for at in pairs if not seen.light.unlit(int(partner[at]))]
-    # The most alike of them: a frame without light, or a crumb in it, makes one pair unlike, wrong angles make all.
+    stated = [(int(some[at]), int(partner[at])) for at in pairs if seen.lit(int(partner[at]))]
+    # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
     off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
     if off < 2 * _UNLIKE * near or (not stated and not mirrored):
         return None
@@ -256,7 +264,9 @@ def _turn_seen(
     around = views[np.abs(degrees[views] - degrees[moved]) < step]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
-    if abs(turned - period) <= _STEPS_OFF * step or not best < min(2 * near, off / _UNLIKE, usual / _UNLIKE):
+    if abs(turned - period) <= max(_OTHER * period, 2 * step) or not best < min(
+        2 * near, off / _UNLIKE, usual / _UNLIKE
+    ):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
@@ -264,12 +274,12 @@ def _turn_seen(
 def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:
     half, whole = ("half a turn", 180.0) if mirrored else ("a turn", 360.0)
     counted = _counted(degrees)
-    gradians = abs(turn.degrees / (whole / 0.9) - 1) < np.ptp(degrees) / VIEWS / turn.degrees
+    known = [factor for factor in _FACTORS if abs(turn.degrees - whole * factor) < np.ptp(degrees) / VIEWS]
     unit = (
         "they are 0, 1, 2 and so on, and count the views"
         if counted
         else f"they look like gradians, of which {whole / 0.9:g} are {half}"
-        if gradians
+        if known == [_FACTORS[0]]
         else f"they look {whole / turn.degrees:.3g} times as large as stated"
     )
     said = (
@@ -279,8 +289,8 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
     if turn.stated is not None:
         said += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
-    # symmetric may look so, too.
-    sure = not source.plan and (turn.stated is not None or counted)
+    # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
+    sure = not source.plan and (counted or (turn.stated is not None and bool(known)))
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
