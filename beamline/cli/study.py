@@ -24,7 +24,7 @@ from recon.methods import BASELINE, DEFAULT, names
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "axis", "rings", "seconds", "steps", "iterations", "output"),
+    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output"),
 )
 @heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))

@@ -41,7 +41,6 @@ def listed(value: str) -> tuple[str, ...]:
         "rows",
         "binning",
         "axis",
-        "rings",
         "output",
     ),
 )
