@@ -86,10 +86,10 @@ def volumes(run: str | Path) -> Iterator[Volume]:
         DataError: no folder of a run.
     """
     folder, shown = Path(run), None
-    files = watched(folder).volumes
+    watch = watched(folder)
     while True:
         over = describe(folder).state in _OVER  # asked before the volume, so that none is missed
-        found = newest(files)
+        found = newest(watch.volumes)
         if found is not None and found != shown:
             with suppress(DataError), opened_volume(found.path) as record:  # the next volume is taking its place
                 volume = replace(record.volume, data=np.array(record.volume.data))
