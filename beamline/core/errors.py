@@ -87,12 +87,12 @@ def memory_limit_said() -> str:
     from beamline.core.machine import memory_limit  # here, because most messages need none of it
 
     limit = memory_limit()
-    return "" if limit is None else f" This process may take {size(limit)} of addresses (ulimit -v)."
+    return "" if limit is None else f" This process may use {size(limit)} of address space (ulimit -v)."
 
 
 _NO_MEMORY = re.compile(
-    "failed to map segment|can't start new thread|bad_alloc|memory allocation (of|failed)|out of memory|"
-    "not enough memory|(can't|cannot|could not|failed to|unable to) allocate",
+    "failed to map segment(?!.*not permitted)|can't start new thread|bad_alloc|memory allocation (of|failed)|"
+    "out of memory|not enough memory|(can't|cannot|could not|failed to|unable to) allocate(?!.*static TLS)",
     re.IGNORECASE,
 )
 """Sentences of the loader of libraries, Python's threads, C++, Rust, HDF5, torch (also CUDA), LLVM and numpy."""

@@ -46,6 +46,8 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
         try:
             sink(event)
         except BaseException as error:  # of somebody's code; SystemExit would end the announcer in silence
+            if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
+                raise  # Ctrl-C
             works = False
             why = f"{type(error).__name__}: {error}"
             others(Warned(f"An output of events failed and gets no further events: {why}", time=event.time))

@@ -96,7 +96,8 @@ def mass_missing(flats: Sequence[Group], darks: Sequence[Group], views: Group) -
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * darker:
         sentence = (
             f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
-            "matter elsewhere, though a sample only takes light: the sample was in the beam."
+            "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
+            "shape between flats and views."
         )
         return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, sentence)
     noise = noise_of(depth - depth.mean(axis=0))

@@ -87,7 +87,8 @@ class PageServer:
         self._server = _Server(
             uvicorn.Config(
                 app, log_level="warning", access_log=False, lifespan="off",
-                timeout_graceful_shutdown=1, server_header=False, http=_connections(access.strangers),
+                timeout_graceful_shutdown=1, server_header=False, proxy_headers=False,
+                http=_connections(access.strangers),
             ),
             access.ended,
         )  # fmt: skip

@@ -323,12 +323,15 @@ class Recorder:
     def _give_up_checks_that_hang(self) -> None:
         """Switch the monitor off where it takes too long, and take its frame; the first thread may hang for ever."""
         with suppress(IndexError):  # it has come back
-            frame, since = self._under_checks[0]
+            looked_at = self._under_checks[0]
+            frame, since = looked_at
             usual = COMPILES if frame is None else CHECKS
             limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
             if (seconds := time.monotonic() - since) <= limit:
                 return
-            frame, _ = self._under_checks.pop()
+            if (taken := self._under_checks.pop()) is not looked_at:  # it came back, and has the next frame
+                self._under_checks.append(taken)
+                return
             self._monitor_off = self._alone = True
             where = "its rehearsal" if frame is None else f"frame {frame.index}"
             self._sink(

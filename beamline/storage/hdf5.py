@@ -339,7 +339,7 @@ def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
             seen.add(place)
             if isinstance(item, h5py.Group) and depth < _DEEPEST:
                 groups.append((item, depth + 1))
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3):
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif" and item.ndim in (2, 3, 4):
                 yield item
 
 

@@ -217,7 +217,8 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
     Raises:
         DataError: `damage`, where no frame can be read; or the disk does not take the new file. Nothing is changed.
     """
-    overlay, kept = WholeBlocks(path, length=max(head.end, head.size)), path.with_name(f"{path.name}.damaged")
+    overlay = WholeBlocks(path, length=max(head.end, head.size))
+    new, kept = path.with_name(f"{path.name}.recovered"), path.with_name(f"{path.name}.damaged")
     overlay.put(0, head.closed(max(head.end, head.size)).head)
     try:
         with h5py.File(overlay, "r") as file:
@@ -226,19 +227,37 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
             committed, frames = int(file[layout.COMMITTED][()]), _rows_readable(file)
             if not frames or not head.open_for_writing:
                 raise damage
-            say(f"{path}: to recover it takes {size(head.size)} on its disk; the damaged file stays as {kept.name}.")
+            say(
+                f"{path} cannot be mended in place: its frames are copied to a new file of about {size(head.size)}; "
+                f"the damaged file is kept as {kept.name}."
+            )
+            if kept.exists() and kept.samefile(path):
+                kept.unlink()  # a recovery died between its last two steps
             refuse_existing(kept)
-            with whole_file(path, replace=True) as partial:
-                with hdf5.created(partial, layout.LIBVER) as made:
-                    copy_rows(file, frames, made)
-                    lost = tuple(range(frames, committed))
-                    reason = f"{DIED} Its last frames are not whole on the disk, from frame {frames} on."
-                    state_ending(made, Ending("failed", gaps_in(path, made), reason))
-                    missing, damaged, altered = _views_missing(made), _damaged(made), _altered(made, frames)
-                os.link(path, kept)
+            with whole_file(new, replace=True) as partial, hdf5.created(partial, layout.LIBVER) as made:
+                copy_rows(file, frames, made)
+                lost = tuple(range(frames, committed))
+                reason = f"{DIED} Its last frames are not whole on the disk, from frame {frames} on."
+                state_ending(made, Ending("failed", gaps_in(path, made), reason))
+                missing, damaged, altered = _views_missing(made), _damaged(made), _altered(made, frames)
     except hdf5.ALTERED as error:
         raise damage from error
+    overlay.close()  # Windows renames no open file
+    _take_place(new, path, kept)
     return Recovered(path, True, frames, 0, missing, lost, damaged, altered, f"The damaged file is {kept} now.")
+
+
+def _take_place(new: Path, path: Path, kept: Path) -> None:
+    """`new` becomes `path`, and what `path` was `kept`; at once where the disk has links. OSError: nothing changed."""
+    try:
+        os.link(path, kept)
+    except OSError:
+        path.rename(kept)
+    try:
+        new.replace(path)
+    except OSError:
+        kept.replace(path)
+        raise
 
 
 def _rows_readable(file: h5py.File) -> int:

@@ -54,7 +54,9 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
 
 
 def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
-    """The settings with which so many seconds, and nothing else, end a run of the method."""
+    """The settings with which so many seconds, and nothing else, end a run of the method; see `Traits.own_length`."""
+    if method.traits.own_length:
+        return {}
     lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
     return {name: value for name, value in lengths.items() if has_setting(method, name)}
 

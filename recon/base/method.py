@@ -139,6 +139,7 @@ class Traits:
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
+        own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
         error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
     """
@@ -151,6 +152,7 @@ class Traits:
     budget: bool = False
     any_grid: bool = False
     needs_matter: bool = False
+    own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None
 

@@ -21,7 +21,7 @@ _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
-_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_COUNTED = ". They are 0, 1, 2 and so on: do they count the frames?"
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 _OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
 _FACTORS = 1 / 0.9, 2.0, 0.5  # of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses
@@ -104,7 +104,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "angle-spread",
             f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
+            + (_COUNTED.removeprefix(".") if np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 
@@ -195,6 +195,8 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
         return
     light = ViewLight.of(source, reference_groups(source).good() if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
+    if views.size < _LEAST_SEEN:
+        return
     views = views[np.argsort(source.angles[views], kind="stable")]
     seen = _Views(source, light)
     some = some_of(views, VIEWS)
@@ -214,7 +216,9 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
         if turn is not None:
             yield _angles_finding(source, degrees[views], turn, mirrored)
             return
-    if source.cone is None and (scale := _scale_by_mass(seen, some)) is not None:
+    if source.cone is not None or _stated_apart(seen, views, some, degrees, 180.0):
+        return  # pairs that fit tell more than the mass, which a sample that creeps spoils
+    if (scale := _scale_by_mass(seen, some)) is not None:
         counted = _counted(degrees[views])
         yield Finding(
             "error" if counted and not source.plan else "warning",
@@ -245,11 +249,7 @@ def _turn_seen(
         near: how much neighbours of these some differ.
     """
     period, step = (180.0 if mirrored else 360.0), float(np.ptp(degrees[some])) / (some.size - 1)
-    partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
-    own = float(np.median(np.diff(np.unique(degrees[views]))))
-    pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= min(own, step))
-    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
-    stated = [(int(some[at]), int(partner[at])) for at in pairs if seen.lit(int(partner[at]))]
+    stated = _stated_apart(seen, views, some, degrees, period)
     # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
     off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
     if off < 2 * _UNLIKE * near or (not stated and not mirrored):
@@ -261,7 +261,7 @@ def _turn_seen(
     found = [seen.unlike([pair], mirrored) for pair in ends]
     usual, (one, other) = float(np.median(found)), ends[int(np.argmin(found))]
     fixed, moved = (one, other) if one == first else (other, one)
-    around = views[np.abs(degrees[views] - degrees[moved]) < step]
+    around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
     if abs(turned - period) <= max(_OTHER * period, 2 * step) or not best < min(
@@ -269,6 +269,17 @@ def _turn_seen(
     ):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
+
+
+def _stated_apart(
+    seen: _Views, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], period: float
+) -> list[tuple[int, int]]:
+    """A few pairs of views with light that are stated to be so many degrees apart, within a step."""
+    partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
+    step = min(float(np.median(np.diff(np.unique(degrees[views])))), float(np.ptp(degrees[some])) / (some.size - 1))
+    pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= step)
+    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
+    return [(int(some[at]), int(partner[at])) for at in pairs if seen.lit(int(partner[at]))]
 
 
 def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:

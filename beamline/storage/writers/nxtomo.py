@@ -271,7 +271,7 @@ class NXtomoWriter:
     def _require_untouched(self) -> None:
         """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
         now = os.fstat(self._handle)
-        if now.st_nlink < self._before.st_nlink:
+        if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
             raise _TouchedError(errno.ENOENT, "it was deleted")
         if now.st_size < self._before.st_size:
             raise _TouchedError(errno.EIO, f"it was cut from {self._before.st_size} to {now.st_size} bytes")
@@ -296,9 +296,11 @@ class NXtomoWriter:
                 f"{self._committed} frames written some or all are lost. Copy what is left, try `beamline recover` on "
                 "the copy, and scan again."
             )
-        free = shutil.disk_usage(self.path.parent).free
+        free = ""
+        with suppress(OSError):  # the folder may have moved
+            free = f"; {size(shutil.disk_usage(self.path.parent).free)} are free on its disk"
         return DataError(
-            f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "
+            f"{self.path} could not {what} ({hdf5.reason(error)}){free}. "
             f"The first {self.safe} frames are safe in it: `beamline recover` makes an ordinary file of them."
         )
 

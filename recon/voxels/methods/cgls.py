@@ -30,7 +30,7 @@ class Cgls:
 
     name: ClassVar[str] = "cgls"
     label: ClassVar[str] = "CGLS"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(own_length=True)
 
     iterations: int = 10
     allow_negative: bool = False

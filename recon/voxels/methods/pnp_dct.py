@@ -33,7 +33,7 @@ class PnpDct:
 
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
-    traits: ClassVar[Traits] = Traits(halo=16)
+    traits: ClassVar[Traits] = Traits(halo=16, own_length=True)
 
     iterations: int = 35
     patch_threshold: float | None = None
