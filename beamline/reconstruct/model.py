@@ -16,7 +16,7 @@ from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.ingest import PER_FLUSH, complete
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
@@ -154,7 +154,7 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
             if view % PER_FLUSH == PER_FLUSH - 1:
                 rows.flush()
         rows.flush()
-        complete(file, Ending())
+        complete(file, ScanEnding())
 
 
 def write_ply(path: Path, model: Model) -> None:

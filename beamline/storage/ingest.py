@@ -27,7 +27,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import DIED, RUNNING, Ending, state_ending
+from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, state_ending
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
@@ -153,7 +153,7 @@ def _copy(
     return invalid
 
 
-def complete(file: hdf5.NewFile, ending: Ending) -> None:
+def complete(file: hdf5.NewFile, ending: ScanEnding) -> None:
     """State that a file that `layout.create` made holds all frames of its scan, and how that ended; add /exchange."""
     file[layout.COMMITTED][()] = len(file[layout.DATA])
     state_ending(file, ending)
@@ -162,7 +162,7 @@ def complete(file: hdf5.NewFile, ending: Ending) -> None:
     add_exchange_view(file)
 
 
-def _ending_of(source: ScanSource) -> Ending:
+def _ending_of(source: ScanSource) -> ScanEnding:
     """How the scan ended. DataError while it runs: what it lacks is not known yet."""
     if source.ending.status != RUNNING:
         return source.ending

@@ -30,7 +30,7 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import DIED, RUNNING, Ending, ending_in, state_ending, state_words
+from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, ending_in, state_ending, state_words
 from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
 from beamline.storage.writers.rows import altered_rows
 
@@ -238,7 +238,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
                 copy_rows(file, frames, made)
                 lost = tuple(range(frames, committed))
                 reason = f"{DIED} Its last frames are not whole on the disk, from frame {frames} on."
-                state_ending(made, Ending("failed", gaps_in(path, made), reason))
+                state_ending(made, ScanEnding("failed", gaps_in(path, made), reason))
                 missing, damaged, altered = _views_missing(made), _damaged(made), _altered(made, frames)
     except hdf5.ALTERED as error:
         raise damage from error
@@ -303,7 +303,7 @@ def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
     file[layout.COMMITTED][()], file[layout.FINISHED][()] = frames, 1
     ending = ending_in(file)
     if ending.status == RUNNING:
-        ending = Ending("failed", gaps_in(path, file), DIED)
+        ending = ScanEnding("failed", gaps_in(path, file), DIED)
     if frames < committed:
         lost = f"Frames {spans(range(frames, committed))} were written and are not on the disk."
         ending = replace(ending, status="failed", reason=f"{ending.reason} {lost}".strip())

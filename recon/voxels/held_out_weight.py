@@ -196,7 +196,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> Preferred | None:
     geometry = problem.projector.geometry
     if not (_can_hold_out(geometry) and first > 0 and problem.trial_goes_on()):
         return None
-    return least_in_octaves(Trial.of(problem), first)
+    return least_in_octaves(WeightTrial.of(problem), first)
 
 
 def least_in_octaves(error: Callable[[float], float], first: float) -> Preferred | None:
@@ -235,7 +235,7 @@ def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
     geometry = problem.projector.geometry
     pays = is_coarse_cone(problem.projector) and geometry.detector_shape[0] >= _FEWEST_ROWS
     pays = pays and geometry.n_views >= LEAST_VIEWS and first > 0
-    trial = Trial.of_cone(problem) if pays and problem.trial_goes_on() else None
+    trial = WeightTrial.of_cone(problem) if pays and problem.trial_goes_on() else None
     return None if trial is None else heaviest_in_octaves(trial, first)
 
 
@@ -269,7 +269,7 @@ def bregman_weight(problem: VoxelProblem, weight: float, residual: float | None 
     At the same noise two runs show more of a crack than one, most where views are few (docs/notes/exploration.md).
     `residual`: of the search for `weight`; where two runs are clearly above it, one run is not tried again.
     """
-    error = Trial.of(problem)
+    error = WeightTrial.of(problem)
     heavy = error(_HEAVY * weight, twice=True)
     if residual is not None and heavy > _BY_CHANCE * residual:
         return None
@@ -305,7 +305,7 @@ def residuals_of_rounds(
     errors: list[float] = []
     if not slices_are_rows(problem.projector):
         return errors
-    trial = Trial.of(problem, start)
+    trial = WeightTrial.of(problem, start)
     x = trial.start.copy()
 
     def further(sweep: int, residual: float) -> bool:
@@ -321,7 +321,7 @@ def residuals_of_rounds(
     return errors
 
 
-class Trial:
+class WeightTrial:
     """Volumes of a slab with several weights, judged by views that the trials have not seen."""
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
@@ -330,21 +330,21 @@ class Trial:
         self._asked, self._ended = problem.go_on, False
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32 | None = None) -> Trial:
+    def of(cls, problem: VoxelProblem, start: F32 | None = None) -> WeightTrial:
         """The trial of the rows with most matter, from those slices of `start` [y, x, z]; None: from FBP."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         rows = busiest_rows(problem.data.swapaxes(1, 2), _ROWS)
         return cls._of_rows(problem, rows, *slab_of(geometry, grid, rows.start, rows.stop), start)
 
     @classmethod
-    def of_cone(cls, problem: VoxelProblem) -> Trial | None:
+    def of_cone(cls, problem: VoxelProblem) -> WeightTrial | None:
         """The trial of the middle rows, from their FDK; None as `middle_of_cone`."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         found = middle_of_cone(geometry, grid, problem.data.swapaxes(1, 2), _ROWS)
         return None if found is None else cls._of_rows(problem, *found, None)
 
     @classmethod
-    def of_some_rows(cls, problem: VoxelProblem) -> Trial | None:
+    def of_some_rows(cls, problem: VoxelProblem) -> WeightTrial | None:
         """The trial of a parallel beam or of a cone. None: fewer than 16 views, or a cone as `middle_of_cone`."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
@@ -355,7 +355,7 @@ class Trial:
         return cls.of_cone(problem) if rows > _ROWS else cls._of_rows(problem, slice(0, rows), geometry, grid, None)
 
     @classmethod
-    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, start: F32 | None) -> Trial:
+    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, start: F32 | None) -> WeightTrial:
         def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
             def cut(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, :, rows])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 
@@ -38,7 +38,7 @@ class ArraySource:
     altered: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     finished = True
-    ending = Ending()
+    ending = ScanEnding()
     times = None
     emission = None
     plan: dict[str, Any] = {}  # noqa: RUF012

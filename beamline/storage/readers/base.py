@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
@@ -109,9 +109,9 @@ class ScanSource(ABC):
         return True
 
     @property
-    def ending(self) -> Ending:
+    def ending(self) -> ScanEnding:
         """How the scan ended, as far as the file tells; a copy states the same."""
-        return Ending()
+        return ScanEnding()
 
     @property
     def attributes(self) -> Attributes:

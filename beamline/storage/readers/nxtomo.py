@@ -36,7 +36,7 @@ from beamline.storage.readers.nexus_geometry import differing, read_energy, read
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_copied, not_used
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import RUNNING, Ending, ending_in
+from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
 
@@ -198,9 +198,9 @@ class NXtomoSource(ScanSource):
         return said
 
     @property
-    def ending(self) -> Ending:
+    def ending(self) -> ScanEnding:
         if not self._ours:
-            return Ending()
+            return ScanEnding()
         with hdf5.readable(self.path):
             ending = ending_in(self._file)
             return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending

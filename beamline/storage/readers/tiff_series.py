@@ -28,7 +28,7 @@ from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.image_names import angles_of, kinds_of, without_angle
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image, refuse_volume
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
@@ -89,8 +89,8 @@ class TiffSeriesSource(ScanSource):
             self.facts |= {"angles_from": "the names of the files"}
 
     @property
-    def ending(self) -> Ending:
-        return Ending(missing=self._missing)
+    def ending(self) -> ScanEnding:
+        return ScanEnding(missing=self._missing)
 
     @property
     def angle_text(self) -> tuple[str, str] | None:

@@ -19,7 +19,7 @@ from beamline.core.text import count
 from beamline.storage import hdf5
 from beamline.storage.readers.base import Opening, ScanFormat
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import FrameKind
 
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
@@ -93,12 +93,12 @@ class TxrmSource(StacksSource):
     """A scan of a .txrm, whose views may be displaced."""
 
     _shifts: NDArray[np.float64] | None = None
-    _ending = Ending()
+    _ending = ScanEnding()
 
     def set_ending(self, taken: int, planned: int) -> None:
         """How many of the planned views were taken."""
         if taken < planned:
-            self._ending = Ending("stopped", reason=f"{taken} of {count(planned, 'planned view')} were taken.")
+            self._ending = ScanEnding("stopped", reason=f"{taken} of {count(planned, 'planned view')} were taken.")
 
     def set_shifts(self, shifts: NDArray[np.float64]) -> None:
         """Of the views, [view, 2]."""
@@ -111,7 +111,7 @@ class TxrmSource(StacksSource):
         return self._shifts
 
     @property
-    def ending(self) -> Ending:
+    def ending(self) -> ScanEnding:
         return self._ending
 
 

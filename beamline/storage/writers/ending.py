@@ -1,4 +1,4 @@
-"""Ending: how a scan ended, which triggers gave no frame, and why. Every copy of a scan states that of the scan."""
+"""ScanEnding: how a scan ended, which triggers gave no frame, and why. Every copy of a scan states that of the scan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DIED = "The program that took the scan died."
 
 
 @dataclass(frozen=True)
-class Ending:
+class ScanEnding:
     """How a scan ended.
 
     Attributes:
@@ -32,15 +32,15 @@ class Ending:
     reason: str = ""
 
 
-def ending_in(file: h5py.File) -> Ending:
+def ending_in(file: h5py.File) -> ScanEnding:
     """The ending that a scan file of ours states."""
     for path in (layout.STATUS, layout.MISSING):
         hdf5.look_again(file[path])
     status = hdf5.text_of(file[layout.STATUS]) or RUNNING
-    return Ending(status, tuple(file[layout.MISSING][()].tolist()), hdf5.text_at(file, layout.REASON))
+    return ScanEnding(status, tuple(file[layout.MISSING][()].tolist()), hdf5.text_at(file, layout.REASON))
 
 
-def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: Ending) -> None:
+def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
     """Write the ending into a file that `layout.create` made, or into its open datasets, by path.
 
     Files of older versions have no place for the reason.
@@ -51,7 +51,7 @@ def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: Endin
     state_words(datasets, ending)
 
 
-def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: Ending) -> None:
+def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
     """Write status and reason alone, which takes no room on the disk."""
     if layout.REASON in datasets:
         datasets[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()

@@ -28,7 +28,7 @@ from beamline.storage.flag_legend import mark_of, place_of
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import STATUSES, Ending, state_ending, state_words
+from beamline.storage.writers.ending import STATUSES, ScanEnding, state_ending, state_words
 from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.rows import Record, Rows
@@ -194,7 +194,7 @@ class NXtomoWriter:
         After a failed write the file only gets status "failed" and `finished`, and is not closed.
 
         Args:
-            status, missing, reason: see Ending.
+            status, missing, reason: see ScanEnding.
             beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
 
         DataError where the disk does not take it; the frames committed stay readable.
@@ -208,7 +208,7 @@ class NXtomoWriter:
             if self._broken:
                 self._let_go(reason)
                 return
-            self._finish(Ending(status, tuple(missing), reason), beam)
+            self._finish(ScanEnding(status, tuple(missing), reason), beam)
             self._put_exchange_view()
         except FAILURES as error:
             if not self._broken:
@@ -225,7 +225,7 @@ class NXtomoWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: object) -> None:
         self.close("complete" if error is None else "failed", reason="" if error is None else user_message(error))
 
-    def _finish(self, ending: Ending, beam: Sequence[BeamReading]) -> None:
+    def _finish(self, ending: ScanEnding, beam: Sequence[BeamReading]) -> None:
         self.flush()
         series = {
             layout.BEAM_TIME: np.array([reading.time for reading in beam], np.float64),
@@ -261,7 +261,7 @@ class NXtomoWriter:
         Readers see every frame committed.
         """
         try:
-            state_words(self._last, Ending("failed", reason=reason))
+            state_words(self._last, ScanEnding("failed", reason=reason))
             self._last[layout.FINISHED][()] = 1
             for path in (layout.REASON, layout.STATUS, layout.FINISHED):
                 self._last[path].flush()

@@ -11,7 +11,13 @@ from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out_weight import CHOICE_SWEEPS, Trial, heaviest_in_octaves, is_coarse_cone, least_in_octaves
+from recon.voxels.held_out_weight import (
+    CHOICE_SWEEPS,
+    WeightTrial,
+    heaviest_in_octaves,
+    is_coarse_cone,
+    least_in_octaves,
+)
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
@@ -96,7 +102,7 @@ def preferred_strength(problem: VoxelProblem, weight: float) -> float:
         weight: μ of total variation in the first volumes of trials.
     """
     first = _FIRST * noise_of_volume(problem)
-    trial = Trial.of_some_rows(problem) if first > 0 else None
+    trial = WeightTrial.of_some_rows(problem) if first > 0 else None
     if trial is None:
         return first
     trial.begin_from(weight)

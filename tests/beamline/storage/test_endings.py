@@ -23,7 +23,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
 from beamline.storage.rules.validate import scan_ended
 from beamline.storage.writer_lock import QUIET
-from beamline.storage.writers.ending import DIED, Ending
+from beamline.storage.writers.ending import DIED, ScanEnding
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
@@ -33,10 +33,10 @@ REFERENCES = {"darks": {"count": 2, "at": "start"}, "flats": {"count": 3, "at": 
 PLAN = json.dumps({"angles_deg": np.linspace(0, 180, VIEWS).tolist(), **REFERENCES})
 LOST = 5 + 2  # the trigger of a view without a frame
 ENDINGS = {
-    "complete": Ending(),
-    "stopped": Ending("stopped", (LOST,), "Stopped by the operator µ."),
-    "failed": Ending("failed", (LOST, 13), "The camera does not answer."),
-    "killed": Ending("failed", (LOST,), DIED),
+    "complete": ScanEnding(),
+    "stopped": ScanEnding("stopped", (LOST,), "Stopped by the operator µ."),
+    "failed": ScanEnding("failed", (LOST, 13), "The camera does not answer."),
+    "killed": ScanEnding("failed", (LOST,), DIED),
 }
 
 
@@ -87,7 +87,7 @@ def test_numbers_that_a_series_of_files_leaves_out_are_missing_in_its_copy(tmp_p
         tifffile.imwrite(folder / f"{name}.tif", np.full(SHAPE, 7, np.uint16))
     ingest(SourceOptions(folder, angles=np.array([0.0, 0.1, 0.3])), tmp_path / "copy.h5")
     with open_scan(tmp_path / "copy.h5") as source:
-        assert source.ending == Ending(missing=(4,))
+        assert source.ending == ScanEnding(missing=(4,))
 
 
 @pytest.mark.parametrize("end", [*ENDINGS, "running"])

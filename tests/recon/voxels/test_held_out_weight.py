@@ -140,7 +140,7 @@ def test_from_weights_that_change_nothing_the_search_goes_on_to_heavier_ones(
         octave = round(math.log2(weight / 3.0))
         return 1.08 + 0.0002 * octave if octave < 3 else 1 + abs(octave - heaviest + (heaviest == 4) / 2) / 100
 
-    monkeypatch.setattr("recon.voxels.held_out_weight.Trial", Mock(of=lambda problem: error))
+    monkeypatch.setattr("recon.voxels.held_out_weight.WeightTrial", Mock(of=lambda problem: error))
     found = preferred_weight(_views(), 3.0)
     assert found is not None and math.log2(found.weight / 3.0) == pytest.approx(best)
 
@@ -154,7 +154,7 @@ def test_two_runs_are_taken_where_they_predict_unseen_views_better(
 ) -> None:
     errors = {(2.0, False): once, (5.0, True): less_heavy, (6.0, True): heavy}
     trial = Mock(of=lambda problem: lambda weight, twice=False: errors[weight, twice])
-    monkeypatch.setattr("recon.voxels.held_out_weight.Trial", trial)
+    monkeypatch.setattr("recon.voxels.held_out_weight.WeightTrial", trial)
     assert bregman_weight(_views(), 2.0) == found
 
 
@@ -165,13 +165,13 @@ def test_one_run_is_not_tried_again_where_two_are_clearly_worse(monkeypatch: pyt
         tried.append(twice)
         return 2.0
 
-    monkeypatch.setattr("recon.voxels.held_out_weight.Trial", Mock(of=lambda problem: error))
+    monkeypatch.setattr("recon.voxels.held_out_weight.WeightTrial", Mock(of=lambda problem: error))
     assert bregman_weight(_views(), 2.0, 1.9) is None and tried == [True]
 
 
 def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Mock(of=lambda problem: lambda weight: 1 + math.log(weight / (3.0 * best)) ** 2)
-    monkeypatch.setattr("recon.voxels.held_out_weight.Trial", trial)
+    monkeypatch.setattr("recon.voxels.held_out_weight.WeightTrial", trial)
 
 
 def _views() -> Mock:

@@ -21,7 +21,7 @@ from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
 from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.writers.ending import Ending
+from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import BEAM, TwoCylinders
 from tests.beamline.storage.compound import write_compound
@@ -114,7 +114,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
     with open_scan(path) as source:
         assert (source.quantity, source.pixel_size_mm) == ("unknown", None)
         assert source.image_key.tolist() == [FrameKind.PROJECTION] * 30
-        assert source.ending == Ending("stopped", reason="30 of 120 planned views were taken.")
+        assert source.ending == ScanEnding("stopped", reason="30 of 120 planned views were taken.")
         assert np.isnan(source.exposures).all()
     assert describe(path)["format"] == "txrm"
     lost = write_compound(tmp_path / "a.txrm", streams(ImageInfo__Angles=None))
