@@ -23,7 +23,6 @@ from recon.base.arrays import median_deviation
 BLOCK_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
 LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
 CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
-SAME = 0.1  # noises of a place: two frames of one scene differ by more, however alike they are
 BRIGHTER = 0.5  # of the depth of the views, by which places must be brighter than in flats with the sample in
 LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
 DRIFTS = 0.02  # of the light, by which a beam may change unnoticed (as in the check `beam`): less tells nothing
@@ -69,8 +68,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     if (depth := _depth_over_air(flats, darks, views)) is not None:
         brighter = min(brighter, -float(np.median(np.percentile(depth, 100 - WORST, axis=(1, 2)))))
     limit = max(BRIGHTER * darker, BLOCK_SIGMAS * noise)
-    same = spreads[nearest] < SAME * noise
-    if not (same or brighter > limit > 0):
+    if not brighter > limit > 0:
         return None
     sentence = (
         f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by "

@@ -167,15 +167,21 @@ class _Views:
             return bool(np.ptp(self.depth(row)))
         return brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
 
-    def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool) -> float:
-        """1 less the correlation of pairs of views; of mirror images about the one column that fits them best."""
-        cols = self.depth(pairs[0][0]).shape[1]
-        moves = np.arange(-(cols // 4) * _PARTS, cols // 4 * _PARTS + 1) / _PARTS if mirrored else np.zeros(1)
+    def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool, reach: float = 0.25) -> float:
+        """1 less the correlation of pairs of views; of mirror images about the one column that fits them best.
+
+        `reach`: how far mirror images are moved, of the field: twice as far as the axis is from its middle. It is
+        doubled once where the best move is the farthest.
+        """
+        farthest = int(reach * self.depth(pairs[0][0]).shape[1])
+        moves = np.arange(-farthest * _PARTS, farthest * _PARTS + 1) / _PARTS if mirrored else np.zeros(1)
         curve = np.zeros(len(moves))
         for one, other in pairs:
             a, b = self.depth(one), self.depth(other)[:, :: -1 if mirrored else 1]
             a, b = ((each[:, :-2] + 2 * each[:, 1:-1] + each[:, 2:]) / 4 for each in (a, b))
             curve += [1 - _correlation(*_laid_on(a, b, move)) for move in moves.tolist()]
+        if mirrored and reach < 0.5 and int(np.argmin(curve)) in (0, len(curve) - 1):
+            return self.unlike(pairs, mirrored, 2 * reach)
         return float(curve.min()) / len(pairs)
 
 
@@ -301,11 +307,12 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
         said += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
     # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
-    sure = not source.plan and (counted or (turn.stated is not None and bool(known)))
+    sure = not source.plan and turn.stated is not None and (counted or bool(known))
+    which = "The" if sure else "Unless the sample moved or is symmetric, the"
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
-        f"{said}. The angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+        f"{said}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
     )
 
 
