@@ -9,7 +9,6 @@ unchanged.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, LONGEST
 from beamline.core.files import EVENTS, open_below, parts_of, run_of, whole_file
+from beamline.core.process import json_object
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -60,8 +60,13 @@ def views_in(file: h5py.File) -> frozenset[int]:
 
 def views_planned(file: h5py.File) -> int | None:
     """Number of planned views of the scan; None if the file does not hold its plan."""
-    angles = json.loads(file["/entry/record/plan"].asstr()[()]).get("angles_deg")
+    angles = _plan_of(file).get("angles_deg")
     return None if angles is None else len(angles)
+
+
+def _plan_of(file: h5py.File) -> dict[str, Any]:
+    """The plan of the scan; empty if the file does not hold it."""
+    return json_object(file["/entry/record/plan"].asstr()[()]) or {}
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
@@ -77,7 +82,11 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     before = np.isin(kinds[: views[0]], (FrameKind.DARK, FrameKind.FLAT))
     first = np.flatnonzero(before)[-1] + 1 if before.any() else 0
     seen = triggers[first : views[-1] + 1]
-    return tuple((_planned_before_views(file) + np.setdiff1d(np.arange(seen.max()), seen)).tolist())
+    return tuple(
+        (
+            _planned_before_views(file) + np.setdiff1d(np.arange(min(int(seen.max()), views_planned(file) or 0)), seen)
+        ).tolist()
+    )
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
@@ -92,14 +101,14 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
 
 def _planned_before_views(file: h5py.File) -> int:
     """Number of references planned before the views."""
-    plan = json.loads(file["/entry/record/plan"].asstr()[()])
+    plan = _plan_of(file)
     fields = (plan.get(kind, {}) for kind in ("darks", "flats"))
     return sum(int(field["count"]) for field in fields if field.get("at") in ("start", "both"))
 
 
 def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
     """Numbers of references planned after the views, in the order of acquisition."""
-    plan = json.loads(file["/entry/record/plan"].asstr()[()])
+    plan = _plan_of(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
     return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in ("end", "both")}
 
