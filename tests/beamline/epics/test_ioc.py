@@ -165,7 +165,7 @@ def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> Non
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as scan:
             assert scan.stderr is not None
             _until(server, lambda: client.get("T:ScanStatus") == "acquiring" and client.get("T:ImagesSaved") > 6)
-            assert client.get("T:ImagesPlanned") > 2000 and client.get("T:FrameRate") > 0
+            _until(server, lambda: client.get("T:ImagesPlanned") > 2000 and client.get("T:FrameRate") > 0)
             _put(server, client, "T:PauseScan")
             _until(server, lambda: client.get("T:ScanStatus") == "paused")
             _put(server, client, "T:ResumeScan")
