@@ -139,7 +139,8 @@ def reconstruct_file(
             leaves=deadline.leaves,
         )
         partial_volume = options.partial_path if slabs and options.becomes_output else None
-        metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)
+        with stopping():  # the volume is there: the first signal no longer discards it
+            metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)
         del outcome  # Windows removes no file that is mapped
     return metrics
 

@@ -216,3 +216,18 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
     result = beamline("recon", "scan.h5", *fewer)
     assert result.exit_code == 2
     assert "60 steps behind it" in result.stderr and "--steps" in result.stderr and "other.h5" not in left(folder)
+
+
+def test_ctrl_c_while_a_volume_is_measured_and_written_does_not_discard_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = offline.write_result
+
+    def interrupted(*arguments: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return write(*arguments)
+
+    monkeypatch.setattr(offline, "write_result", interrupted)
+    result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "3", "--no-report")
+    assert result.exit_code == 0, result.output
+    assert not read_reconstruction(folder / "scan_sirt.h5").parameters.get("ended_early")
