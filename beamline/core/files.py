@@ -251,8 +251,6 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
             partial.replace(path)
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
-        with suppress(OSError):  # the file is there in any case
-            folder_to_disk(path.parent)
     except OSError as error:
         if out_of_memory(error):
             raise

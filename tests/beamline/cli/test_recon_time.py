@@ -192,7 +192,7 @@ def test_a_stop_during_the_fit_writes_the_volumes_so_far(
     def interrupted(fit: energy_fit.EnergyFit, weights: np.ndarray, n: int):  # type: ignore[no-untyped-def,type-arg]
         for number, residual in enumerate(sweeps(fit, weights, n)):
             every = fit.views.geometry.n_views == 36  # the fit itself, after go_on has heard of its first sweep
-            if every and (n, number) == (60, 1):
+            if every and (n, number) == (30, 1):
                 os.kill(os.getpid(), signal.SIGINT)
             yield residual
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -122,6 +123,7 @@ def test_a_writer_that_is_killed_leaves_views_as_good_as_those_of_a_scan_that_wa
     assert written.wait(60)
     writer.kill()
     writer.join(60)
+    os.utime(tmp_path / "died.h5", (0, 0))  # long ago
     ingest(tmp_path / "died.h5", tmp_path / "recovered.h5")
     with NXtomoWriter(tmp_path / "stopped.h5", INFO, INTERLACED.shape, clock=StandingClock()) as whole:
         for frame in frames_of(INTERLACED)[:24]:  # all that was flushed

@@ -179,6 +179,7 @@ def terminal(held: Held) -> Surface:
         while not stop.stopping:
             time.sleep(0.001)
         if verb == "abort":
+            time.sleep(0.2)  # a hand is no faster
             signal.pthread_kill(main, signal.SIGINT)
         sent.set()
 
