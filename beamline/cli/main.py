@@ -174,8 +174,8 @@ class LazyGroup(click.Group):
         needs = _ADDRESSES.get(args[0], 0) if args else 0
         if needs and (limit := memory_limit()) is not None and limit < needs:
             raise DataError(
-                f"Out of memory: this process may take {size(limit)} of addresses (ulimit -v), and the libraries of "
-                f"`beamline {args[0]}` alone take {size(needs)}. Nothing was read or written."
+                f"Out of memory: this process may use {size(limit)} of address space (ulimit -v), and the libraries of "
+                f"`beamline {args[0]}` alone need {size(needs)}. Nothing was read or written."
             )
         return super().resolve_command(ctx, args)
 

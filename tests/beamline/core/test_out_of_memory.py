@@ -1,4 +1,4 @@
-"""Memory that is not there is no defect: under a limit of addresses (ulimit -v), in the words of each library."""
+"""Memory that is not there is no defect: under a limit of address space (ulimit -v), in the words of each library."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_each_library_says_it_in_its_own_words(tmp_path: Path) -> None:
     said = limited(tmp_path, "library, maps, allocates, hdf5, threads")
     assert set(said) == {"library", "maps", "allocates", "hdf5", "threads"}, said
     for name, (code, message) in said.items():
-        assert code == DataError.exit_code and "of addresses (ulimit -v)" in message, said
+        assert code == DataError.exit_code and "of address space (ulimit -v)" in message, said
         if name != "hdf5":  # its filter says no more than that it failed
             assert message.startswith("Out of memory (") and "what was there is untouched" in message, said
 
@@ -93,7 +93,7 @@ def test_a_limit_below_what_the_libraries_take_is_refused_before_they_are_loaded
     command = [sys.executable, "-c", code, "ingest", "no.h5", str(tmp_path / "out.h5")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == DataError.exit_code and not list(tmp_path.iterdir())
-    assert done.stderr.startswith("beamline: Out of memory: this process may take 400 MB of addresses (ulimit -v)")
+    assert done.stderr.startswith("beamline: Out of memory: this process may take 400 MB of address space (ulimit -v)")
 
 
 def _raised_after(cause: BaseException, error: BaseException) -> BaseException:
