@@ -93,7 +93,7 @@ def test_a_limit_below_what_the_libraries_take_is_refused_before_they_are_loaded
     command = [sys.executable, "-c", code, "ingest", "no.h5", str(tmp_path / "out.h5")]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == DataError.exit_code and not list(tmp_path.iterdir())
-    assert done.stderr.startswith("beamline: Out of memory: this process may take 400 MB of address space (ulimit -v)")
+    assert done.stderr.startswith("beamline: Out of memory: this process may use 400 MB of address space (ulimit -v)")
 
 
 def _raised_after(cause: BaseException, error: BaseException) -> BaseException:
