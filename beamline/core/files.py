@@ -100,6 +100,14 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     return place
 
 
+def is_below(folder: Path, name: str) -> bool:
+    """There is such a file, as `require_below` says: no link, no pipe, and not another user's."""
+    try:
+        return require_below(folder, name).is_file()
+    except OSError:
+        return False
+
+
 def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
     """The file that `require_below` finds, open to be read. Where the system can, nobody can put a link or a pipe in
     its place meanwhile: each folder on the way is opened in the one before.

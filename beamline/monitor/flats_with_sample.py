@@ -23,9 +23,9 @@ from recon.base.arrays import median_deviation
 BLOCK_SIGMAS = 3.0  # noises of a place: the mean of a few may be off by so much
 LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
 CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
-BRIGHTER = 0.5  # of the depth of the views, by which places must be brighter than in flats with the sample in
+BRIGHTER = 0.5  # flats hold the sample where places outshine them by this share of what the views take elsewhere
 LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
-DRIFTS = 0.02  # of the light, by which a beam may change unnoticed (as in the check `beam`): less tells nothing
+DRIFTS = 0.02  # of the light: a beam may drift by so much (as in the check `beam`), so a weaker sample is not judged
 AIR = 0.1  # line integral at the edges of the field from which they are no air
 EDGE = 16  # one column in so many, at each edge, is taken for air
 EMPTY, SHALLOW = 8, 10.0  # views at least, and percent of them that may be taken for the emptiest at a place
@@ -55,7 +55,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
         return None
     base = _base(darks)
     light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
-    lit = _lit_places(light)
+    lit = lit_places(light)
     through = _without_drift(np.stack([_log(_cells(view, base), light, lit) for view in views]), lit)
     spreads = np.array([_spread(each) for each in through])
     beyond = np.array([_beyond_noise(each) for each in through])
@@ -134,7 +134,7 @@ def _depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group
         return None
     base = _base(darks)
     light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
-    lit = _lit_places(light)
+    lit = lit_places(light)
     rows = np.flatnonzero(2 * lit.sum(axis=1) > lit.shape[1])
     cols = np.flatnonzero(lit[rows].all(axis=0))
     if not rows.size or cols.size < EDGE:
@@ -191,7 +191,7 @@ def with_sample(
         for i, (image, others) in enumerate(compared):
             if not others:
                 continue
-            lit = _lit_places(np.maximum.reduce([image, *others]))
+            lit = lit_places(np.maximum.reduce([image, *others]))
             changes = [_log(image, other, lit) for other in others]
             change = min(changes, key=_spread)
             off = _beyond_noise(change)
@@ -225,7 +225,8 @@ def _cells(frame: ReferenceFrame, base: Places | float) -> Places:
     return np.asarray(np.nan_to_num(_whole(frame) - base), np.float32)
 
 
-def _lit_places(light: Places) -> NDArray[np.bool_]:
+def lit_places(light: Places) -> NDArray[np.bool_]:
+    """Where images of the beam have light."""
     return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
 
 

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, event_in
-from beamline.core.files import EVENTS, open_below, parts_of, require_below, run_of
+from beamline.core.files import EVENTS, is_below, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
@@ -50,26 +50,20 @@ class Watched:
     @property
     def volumes(self) -> tuple[Path, ...]:
         """Paths of the volumes that the run has."""
-        return tuple(self.run / name for name in (RECON, SNAPSHOT) if _is_there(self.run, name)) if self.run else ()
+        return tuple(self.run / name for name in (RECON, SNAPSHOT) if is_below(self.run, name)) if self.run else ()
 
 
 def watched(path: Path) -> Watched:
     """The paths for a run folder, or a scan file. DataError if there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
-        if not _is_there(folder, EVENTS):
+        if not is_below(folder, EVENTS):
             raise DataError(f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file.")
         return Watched(folder / SCAN, folder)
     if not path.is_file():
         raise DataError(f"{path} is not there.")
-    of_run = path.name == SCAN and _is_there(path.parent, SCAN) and _is_there(path.parent, EVENTS)
+    of_run = path.name == SCAN and is_below(path.parent, SCAN) and is_below(path.parent, EVENTS)
     return Watched(path, path.parent if of_run else None)
-
-
-def _is_there(folder: Path, name: str) -> bool:
-    with suppress(OSError):
-        return require_below(folder, name).is_file()
-    return False
 
 
 class EventLog:

@@ -14,7 +14,7 @@ from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import event_in, whole_lines
-from beamline.core.files import EVENTS, open_below, parts_of, require_below
+from beamline.core.files import EVENTS, is_below, open_below, parts_of
 from beamline.core.text import one_line, size
 from beamline.scan.control import running, state_of
 from beamline.scan.run_folder import CONFIG, CONTROL, SCAN, STAMP
@@ -66,8 +66,8 @@ class Run:
 
 def runs_in(folder: Path) -> list[Path]:
     """The folders of runs in a folder, newest first; also those of the energies of a series in it."""
-    within = [path for path in folder.glob("*/") if not _is_run(path) and (path / CONFIG).is_file()]
-    found = [run for place in (folder, *within) for run in place.glob("*/") if _is_run(run)]
+    within = [path for path in folder.glob("*/") if not is_below(path, EVENTS) and (path / CONFIG).is_file()]
+    found = [run for place in (folder, *within) for run in place.glob("*/") if is_below(run, EVENTS)]
     return sorted(found, key=lambda run: (_began(run), _numbered(run)), reverse=True)
 
 
@@ -122,13 +122,6 @@ def cells(run: Run) -> tuple[str, ...]:
         size(run.bytes), counted(run.flags) if run.flags else "-", f"{of_series}{run.folder.name}",
     )  # fmt: skip
     return tuple(map(one_line, row))
-
-
-def _is_run(run: Path) -> bool:
-    try:
-        return require_below(run, EVENTS).is_file()
-    except OSError:  # none, a link, a pipe, or a file of another user
-        return False
 
 
 def _began(run: Path) -> float:

@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+PACKED = 1e5
+"""No file of images holds so many times its own size: zeros come to 1000 times (deflate), and 20 000 (Zstandard)."""
 _REAL = re.compile(r"[<>=|]?(u1|i1|[uif][248])|u?int(8|16|32|64)|float(16|32|64)")
 _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far beyond any volume
 

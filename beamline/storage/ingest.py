@@ -92,7 +92,7 @@ def ingest(
                 "one size. Reconstruct it as it is. Nothing was written."
             )
         distance = source.attributes.get("distance_mm")
-        other_angles = isinstance(scan, SourceOptions) and not scan.angles is scan.angles_path is None
+        other_angles = isinstance(scan, SourceOptions) and (scan.angles is not None or scan.angles_path is not None)
         if source.cone is not None:
             distance = source.cone[1] - source.cone[0]
         info = layout.ScanInfo(

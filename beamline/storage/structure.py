@@ -16,9 +16,10 @@ import h5py
 
 from beamline.core.errors import DataError
 from beamline.core.files import require_regular
+from beamline.storage.header import PACKED
 
 MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
-CLAIMED, PACKED = 1e9, 1e5  # bytes; and how many times what is stored
+CLAIMED = 1e9  # bytes
 _HEAD = 4096  # bytes that tell text
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 

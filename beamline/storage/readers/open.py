@@ -23,7 +23,14 @@ from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from beamline.storage.readers.wrapped import CroppedSource, PartsSource, TurnedSource, UnsignedSource, has_wrapped
+from beamline.storage.readers.wrapped import (
+    UNPACKED,
+    CroppedSource,
+    PartsSource,
+    TurnedSource,
+    UnsignedSource,
+    has_wrapped,
+)
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
@@ -31,7 +38,7 @@ __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions"
 
 _SHORT = "i1", "i2"  # signed types that cameras' counts do not fit
 _LOOKED_AT = 3  # frames of a kind, for counts that wrapped
-_PIXELS, _UNPACKED = 2**27, 2**30  # of a frame, and bytes of it in a file, of which all rows are looked at
+_PIXELS = 2**27  # of a frame whose rows are all looked at
 REGISTRY = (  # modules in this folder, asked in this order
     "tiff_series",
     "tiff_stack",
@@ -187,7 +194,7 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
             some = rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))]
-            every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // _UNPACKED)
+            every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 
 

@@ -15,11 +15,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.header import PACKED
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-PACKED = 1e5
-"""No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
 UNREADABLE = (
     tifffile.TiffFileError,
     OSError,

@@ -15,7 +15,7 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
-_UNPACKED, _READ = 2**30, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+UNPACKED, _READ = 2**30, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
 class WrappedSource(ScanSource):
@@ -65,7 +65,7 @@ class BriefSource(WrappedSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         n = frame_indices(frames, int(self.image_key.size)).size * len(range(self.shape[0])[rows])
-        if self._over() or self.frame_bytes > _UNPACKED or n * self.shape[1] * self.dtype.itemsize > _READ:
+        if self._over() or self.frame_bytes > UNPACKED or n * self.shape[1] * self.dtype.itemsize > _READ:
             raise LookedEnoughError(
                 "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
                 "validate` looks at them."

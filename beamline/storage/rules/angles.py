@@ -21,7 +21,7 @@ _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
-_COUNTED = ". They are 0, 1, 2 and so on: do they count the frames?"
+_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
 _OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
 _FACTORS = 1 / 0.9, 2.0, 0.5  # of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses
@@ -29,10 +29,7 @@ _PAIRS = 6  # of views that are stated half a turn apart, which are compared
 _UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
 _AROUND = 9  # views about the best of some that are looked at
-_EDGE = 16  # one column in so many, at each edge, is taken for air
-_STEADY = 0.05  # of the mass of the sample in the field: what goes in and out has no centre
-_FAR = 0.01  # of the field, by which the centre of mass must be off
-_PARTS = 4  # of a column, by which mirror images are moved
+_PARTS = 4  # steps to a column in which mirror images are moved
 _LEAST_LIGHT = 1e-3  # of the beam
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
@@ -99,12 +96,14 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "(one a line).",
         )
     elif (unseen := half_turn_unseen(angles)) > 0:
-        said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
+        span_text = (
+            f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
+        )
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED.removeprefix(".") if np.allclose(degrees, np.arange(angles.size)) else ""),
+            f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
+            + (_COUNTED if np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 
@@ -112,9 +111,8 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
 
     Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
-    distributed length, whose mean is that of all gaps (Rényi 1953): of a thousandth (of ten views: a hundredth) by more
-    than is allowed for. Views in
-    even steps have gaps alike, and half a degree more is told.
+    distributed length, whose mean is that of all gaps (Rényi 1953); one scan in a thousand (of ten views: in a hundred)
+    exceeds what is allowed for. Views in even steps have gaps alike, and half a degree more is named.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)
@@ -138,7 +136,7 @@ def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
         for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
             if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
-                return f"these look like {unit}, of which {part:.5g} are {name}."
+                return f"these look like {unit}: {name} is {part:.5g}."
     return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
 
 
@@ -222,17 +220,6 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
         if turn is not None:
             yield _angles_finding(source, degrees[views], turn, mirrored)
             return
-    if source.cone is not None or _stated_apart(seen, views, some, degrees, 180.0):
-        return  # pairs that fit tell more than the mass, which a sample that creeps spoils
-    if (scale := _scale_by_mass(seen, some)) is not None:
-        counted = _counted(degrees[views])
-        yield Finding(
-            "error" if counted and not source.plan else "warning",
-            "angle-spread",
-            f"The centre of mass of the views goes round {scale:.3g} times as fast as the stated angles say"
-            + (_COUNTED if counted else ". Are they in degrees?")
-            + " Give them in degrees with --angles FILE (one a line).",
-        )
 
 
 @dataclass(frozen=True)
@@ -264,9 +251,9 @@ def _turn_seen(
     ends = [(first, row) for row in some[some.size // 4 :].tolist()] + [
         (row, last) for row in some[1 : -(some.size // 4)].tolist()
     ]
-    found = [seen.unlike([pair], mirrored) for pair in ends]
-    usual, (one, other) = float(np.median(found)), ends[int(np.argmin(found))]
-    fixed, moved = (one, other) if one == first else (other, one)
+    differences = [seen.unlike([pair], mirrored) for pair in ends]
+    usual, (early, late) = float(np.median(differences)), ends[int(np.argmin(differences))]
+    fixed, moved = (early, late) if early == first else (late, early)
     around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
@@ -295,16 +282,16 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
     unit = (
         "they are 0, 1, 2 and so on, and count the views"
         if counted
-        else f"they look like gradians, of which {whole / 0.9:g} are {half}"
+        else f"they look like gradians: {half} is {whole / 0.9:g}"
         if known == [_FACTORS[0]]
         else f"they look {whole / turn.degrees:.3g} times as large as stated"
     )
-    said = (
+    pairs = (
         f"Frames {turn.alike[0]} and {turn.alike[1]} are {'mirror images' if mirrored else 'alike'}, as views {half} "
         f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
     )
     if turn.stated is not None:
-        said += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
+        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
     # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
     sure = not source.plan and turn.stated is not None and (counted or bool(known))
@@ -312,40 +299,12 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
-        f"{said}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
     )
 
 
 def _counted(degrees: NDArray[np.float64]) -> bool:
     return bool(np.allclose(np.sort(degrees), np.arange(degrees.size)))
-
-
-def _scale_by_mass(seen: _Views, some: NDArray[np.int64]) -> float | None:
-    """How many times as fast as the angles the centre of mass goes round; None where they fit, or it does not tell.
-
-    The mass of a sample is the same in all views, and its centre is at a sine of the angle (Helgason 1965, Ludwig
-    1966: the moments of orders 0 and 1). A creeping sample has no sine: so the stated angles must fail by a hundredth
-    of the field, and others must fit four times as well.
-    """
-    depth = np.array([seen.depth(row) for row in some.tolist()])
-    n = max(1, depth.shape[2] // _EDGE)
-    air = (depth[:, :, :n].mean(axis=2) + depth[:, :, -n:].mean(axis=2)) / 2
-    depth -= air[:, :, None]
-    mass = depth.mean(axis=(1, 2))
-    if not mass.std() < _STEADY * mass.mean():
-        return None
-    places = np.linspace(0, 1, depth.shape[2])
-    centre = (depth * places).mean(axis=(1, 2)) / mass
-    angles = seen.source.angles[some] - seen.source.angles[some[0]]
-
-    def left(scale: float) -> float:
-        sines = np.stack([np.ones_like(angles), np.cos(scale * angles), np.sin(scale * angles)], axis=1)
-        return float(np.std(centre - sines @ np.linalg.lstsq(sines, centre, rcond=None)[0]))
-
-    scales = np.geomspace(0.2, 5, 200)
-    lefts = [left(scale) for scale in scales]
-    best = int(np.argmin(lefts))
-    return float(scales[best]) if left(1.0) > max(_FAR, _UNLIKE * lefts[best]) else None
 
 
 def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

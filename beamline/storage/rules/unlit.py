@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.references import BRIGHT, UNLIT, ReferenceFrame
+from beamline.monitor.flats_with_sample import lit_places
+from beamline.monitor.references import BRIGHT, ReferenceFrame
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, look_at, reference_frame, some_of
 from drivers.base.frame import FrameKind
@@ -56,7 +57,7 @@ class ViewLight:
         if dark is None or flat is None or not len(data):
             return uniform
         views, (dark, flat) = np.stack([_binned(view) for view in data]), map(_binned, (dark, flat))
-        lit, least = _lit(flat - dark), _SUSPECT * max(self.usual, 0.0)
+        lit, least = lit_places(flat - dark), _SUSPECT * max(self.usual, 0.0)
         shares = (views[:, lit] - dark[lit]) / (flat - dark)[lit]
         dim = np.ones(len(data), np.bool_)
         if lit.any():
@@ -86,7 +87,7 @@ class ViewLight:
 def brightness(view: F32, dark: F32, flat: F32) -> float:
     """Share of the flats' light in a view's bright part, without what noise alone brings there; of images of cells."""
     light = flat - dark
-    lit = _lit(light)
+    lit = lit_places(light)
     if not lit.any():
         return 1.0
     share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
@@ -96,10 +97,6 @@ def brightness(view: F32, dark: F32, flat: F32) -> float:
     if not known.size:
         return 0.0
     return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)
-
-
-def _lit(light: F32) -> NDArray[np.bool_]:
-    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 0.0)
 
 
 def _binned(image: NDArray[np.generic]) -> F32:

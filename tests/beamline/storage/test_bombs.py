@@ -40,7 +40,7 @@ def test_info_does_not_wait_for_frames_that_each_cost_the_whole_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_exchange(tmp_path / "a.h5", TwoCylinders())
-    monkeypatch.setattr(wrapped, "_UNPACKED", 100)
+    monkeypatch.setattr(wrapped, "UNPACKED", 100)
     (said,) = [message for message in described.describe(path)["findings"] if "too long" in message]
     assert "beamline validate" in said
     monkeypatch.undo()

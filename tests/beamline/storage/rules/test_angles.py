@@ -47,7 +47,7 @@ def turn(degrees: float, views: int, endpoint: bool = False) -> NDArray[np.float
 @pytest.mark.parametrize(
     ("true", "stated", "unit"),
     [
-        (turn(180, 120), turn(200, 120), "they look like gradians, of which 200 are half a turn"),
+        (turn(180, 120), turn(200, 120), "they look like gradians: half a turn is 200"),
         (turn(360, 120, endpoint=True), turn(400, 120, endpoint=True), "they look like gradians"),
         (turn(180, 240), np.arange(240.0), "they are 0, 1, 2 and so on, and count the views"),
         (turn(180, 90), np.arange(90.0), "they are 0, 1, 2 and so on, and count the views"),
