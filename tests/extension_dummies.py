@@ -349,11 +349,11 @@ assert wire.transmit() == b"0007"
 
 STEP = Extension(
     {
-        "beamline/projections/steps/lift.py": """
+        "beamline/projections/corrections/lift.py": """
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import StepDone, StepMemory, option
+from beamline.projections.step import StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -378,7 +378,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    (("beamline/projections/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
     """
 from pathlib import Path
 
@@ -387,9 +387,9 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.lift import Lift
-from beamline.projections.steps.registry import recorded
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.lift import Lift
+from beamline.projections.registry import recorded
 from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.scans import TwoCylinders, write_exchange
 

@@ -9,7 +9,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.flags import checked_views
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import EmissionOf, ScanSource
 from recon.prep.correct import Projections
 from recon.voxels.emission import Emission, weighted_lines

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError
+from beamline.projections.corrections.counts import CountModel
 from beamline.projections.selection import Selection, rows_of
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.step import StepDone, ViewFilter, ViewStep
+from beamline.projections.step import StepDone, ViewFilter, ViewStep
 from beamline.storage.readers.base import ScanSource
 from recon.prep.correct import Projections
 

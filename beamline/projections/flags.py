@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding

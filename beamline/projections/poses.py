@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection, choose_views, cone_of, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import RayStep, StepDone
+from beamline.projections.step import RayStep, StepDone
 from beamline.storage.pose_table import PoseTable
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind

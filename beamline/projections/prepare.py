@@ -15,15 +15,15 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.emission import prepare_emission
 from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
+from beamline.projections.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.projections.truncation import cut_said, cut_sides
 from beamline.storage.readers.base import ScanSource

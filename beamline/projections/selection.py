@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.registry import all_steps
-from beamline.projections.steps.step import PrepStep
+from beamline.projections.registry import all_steps
+from beamline.projections.step import PrepStep
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
@@ -34,7 +34,7 @@ class Selection:
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         seed: of random view selections.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
-        steps: corrections that are to do something else than their defaults, see `beamline.projections.steps`.
+        steps: corrections that are to do something else than their defaults, see `beamline.projections.corrections`.
     """
 
     views: str = "all"

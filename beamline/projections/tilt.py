@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection, at_once_memory
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection, cone_of
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.phase import Phase
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt

@@ -14,14 +14,14 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.flags import UsableViews, checked_views, correction_blockers, refuse, usable_views
 from beamline.projections.jumps import frames_text
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, geometry_of
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.jumps import Jumps
-from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone
+from beamline.projections.step import PlaceStep, RayStep, ScanStep, StepDone
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.steps.registry import recorded
+from beamline.projections.registry import recorded
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.reconstruct.remarks import partly_seen
 from beamline.storage.writers.recon_file import Value

@@ -15,13 +15,13 @@ from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import choose_views, cone_of, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import ScanPart, StepMemory
+from beamline.projections.step import ScanPart, StepMemory
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from beamline.cli.main import main
+from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.calibrate import Calibrate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.test_air import bent_and_straight

@@ -11,10 +11,10 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flats import Flats
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flats import Flats
 from recon.prep.correct import Correction, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.projections.truncation import cut_sides
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp

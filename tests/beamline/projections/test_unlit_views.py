@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, decibels_of, line_integrals

@@ -10,10 +10,10 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.base import read_known
 from beamline.storage.readers.open import SourceOptions

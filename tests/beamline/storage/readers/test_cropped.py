@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import CroppedSource

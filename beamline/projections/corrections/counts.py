@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option, positive
+from beamline.projections.step import ScanPart, StepMemory, option, positive
 from recon.base.choices import FEW_PHOTONS, Noise
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from beamline.core.errors import ConfigError
 from beamline.core.files import text_in
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, view_bytes
+from beamline.projections.step import ScanPart, StepDone, StepMemory, ViewFilter, option, view_bytes
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection

@@ -9,10 +9,10 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase import Phase
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.phase import Phase
 from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK

@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import PlaceStep, PrepStep, RayStep, ScanStep, StepDone, ViewStep, options_of
+from beamline.projections.step import PlaceStep, PrepStep, RayStep, ScanStep, StepDone, ViewStep, options_of
 from drivers.plugins import plugins
 
 if TYPE_CHECKING:
@@ -30,14 +30,14 @@ REGISTRY: dict[str, str] = {
     "rings": "Rings",
     "hardening": "Hardening",
 }
-"""Module in this folder, and its class; options stand in this order."""
+"""Module in `corrections`, and its class; options stand in this order."""
 
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
     """Every step, in the order of the registry; those of other packages come last."""
     ours: list[type[PrepStep]] = [
-        getattr(import_module(f"beamline.projections.steps.{module}"), cls) for module, cls in REGISTRY.items()
+        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for module, cls in REGISTRY.items()
     ]
     names = {step.name for step in ours}
     taken = {option.name for step in ours for option in options_of(step).values()}

@@ -12,10 +12,10 @@ import pytest
 import recon
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warnings
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.step import StepDone, options_of
-from beamline.projections.steps.width import Width
+from beamline.projections.step import StepDone, options_of
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory
+from beamline.projections.step import ScanPart, StepMemory
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.defects import Defects
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.defects import Defects
-from beamline.projections.steps.resampling import TiltAndLens
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory, ViewPlaces, option
+from beamline.projections.step import ScanPart, StepMemory, ViewPlaces, option
 
 if TYPE_CHECKING:
     from beamline.projections.flags import UsableViews

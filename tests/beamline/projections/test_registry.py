@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.rings import Rings
+from beamline.projections.registry import all_steps, key_of, recorded, registered, steps_of
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.phase import Phase
-from beamline.projections.steps.registry import all_steps, key_of, recorded, registered, steps_of
-from beamline.projections.steps.rings import Rings
-from beamline.projections.steps.step import StepDone, options_of
+from beamline.projections.step import StepDone, options_of
 
 
 def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:

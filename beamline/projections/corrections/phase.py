@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, positive, view_bytes
+from beamline.projections.step import ScanPart, StepDone, StepMemory, ViewFilter, option, positive, view_bytes
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -105,7 +105,7 @@ class Phase:
         return StepMemory((7 if self.unsharp is None else 9) * view_bytes(part, found.reach))
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
-        from beamline.projections.steps.defects import Defects
+        from beamline.projections.corrections.defects import Defects
 
         if self.material is None:
             return None, StepDone("", {"phase": "not retrieved"})

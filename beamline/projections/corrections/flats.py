@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option, view_bytes
+from beamline.projections.step import ScanPart, StepMemory, option, view_bytes
 from drivers.base.frame import FrameKind
 from recon.base.choices import FlatFields
 

@@ -9,12 +9,12 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
 from beamline.reconstruct.budget import binned
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals

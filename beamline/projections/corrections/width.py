@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.step import ScanPart, StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.step import ScanPart, StepDone, StepMemory, option
 from recon.base.choices import Rings as Way
 
 if TYPE_CHECKING:
