@@ -389,7 +389,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.lift import Lift
-from beamline.projections.registry import recorded
+from beamline.projections.registry import in_order, recorded
 from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -399,7 +399,7 @@ with open_scan(SourceOptions(path)) as source:
     plain, lifted = (prepare_projections(source, each, print) for each in chosen)
 np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
 assert lifted.done["lift"].said == "Lifted by 0.5."
-found = recorded(chosen[1].in_order, lifted.done)
+found = recorded(in_order(chosen[1]), lifted.done)
 assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
 
 def run(*options):

@@ -112,7 +112,7 @@ def test_views_held_out_lose_the_surface_of_their_time(scans: dict[str, Path]) -
         plain = Selection(axis_col=55.5, binning=2, views="fixed:40")
         found, before = (
             prepare_projections(source, selection, lambda said: None)
-            for selection in (plain.having(Calibrate(("background",))), plain)
+            for selection in (plain.with_steps(Calibrate(("background",))), plain)
         )
     assert found.held_out is not None and before.held_out is not None
     taken = before.held_out[0] - found.held_out[0]

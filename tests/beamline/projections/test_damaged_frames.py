@@ -14,8 +14,8 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind

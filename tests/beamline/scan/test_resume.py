@@ -20,8 +20,8 @@ from beamline.core.stop import StopRequest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.references import ReferenceCheck
-from beamline.projections.flags import checked_views
 from beamline.projections.prepare import prepare_projections
+from beamline.projections.refusals import checked_views
 from beamline.projections.selection import Selection
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell

@@ -16,8 +16,8 @@ from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.step import PrepStep
 from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo

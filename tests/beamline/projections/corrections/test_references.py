@@ -19,7 +19,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
-ACCEPT = SELECTION.having(ReferenceCheck("accept"))
+ACCEPT = SELECTION.with_steps(ReferenceCheck("accept"))
 FULL = 65535.0
 
 
