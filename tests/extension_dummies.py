@@ -378,7 +378,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    (("beamline/projections/registry.py", '    "Hardening": "hardening",', '    "Lift": "lift",'),),
     """
 from pathlib import Path
 

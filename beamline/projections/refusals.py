@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import UsableViews, usable_views
+from beamline.projections.usable_views import UsableViews
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged

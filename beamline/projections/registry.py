@@ -17,29 +17,29 @@ if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import Value
 
 REGISTRY: dict[str, str] = {
-    "resampling": "TiltAndLens",
-    "air": "Air",
-    "flags": "Flags",
-    "references": "ReferenceCheck",
-    "counts": "CountModel",
-    "defects": "Defects",
-    "flats": "Flats",
-    "phase": "Phase",
-    "jumps": "Jumps",
-    "poses": "PosesOfFile",
-    "width": "Width",
-    "calibrate": "Calibrate",
-    "rings": "Rings",
-    "hardening": "Hardening",
+    "TiltAndLens": "resampling",
+    "Air": "air",
+    "Flags": "flags",
+    "ReferenceCheck": "references",
+    "CountModel": "counts",
+    "Defects": "counts",
+    "Flats": "references",
+    "Phase": "phase",
+    "Jumps": "jumps",
+    "PosesOfFile": "poses",
+    "Width": "width",
+    "Calibrate": "calibrate",
+    "Rings": "rings",
+    "Hardening": "hardening",
 }
-"""Module in `corrections`, and its class; options stand in this order."""
+"""Class, and its module in `corrections`; options stand in this order."""
 
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
     """Every step, in the order of the registry; those of other packages come last."""
     ours: list[type[PrepStep]] = [
-        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for module, cls in REGISTRY.items()
+        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for cls, module in REGISTRY.items()
     ]
     names = {step.name for step in ours}
     taken = {option.name for step in ours for option in options_of(step).values()}

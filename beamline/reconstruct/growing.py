@@ -14,7 +14,7 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
@@ -23,7 +23,7 @@ from beamline.projections.refusals import checked_views, correction_blockers, re
 from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.projections.step import StepDone
-from beamline.projections.usable_views import UsableViews, usable_views
+from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions

@@ -165,7 +165,7 @@ def find_jumps(
 def _search_memory(source: ScanSource, selection: Selection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
-    from beamline.projections.usable_views import usable_views
+    from beamline.projections.corrections.flags import usable_views
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
+from beamline.projections.corrections.counts import Defects
 from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.step import StepDone, StepMemory, option, positive
 
@@ -106,8 +107,6 @@ class Phase:
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(found.reach))
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
-        from beamline.projections.corrections.defects import Defects
-
         if self.material is None:
             return None, StepDone("", {"phase": "not retrieved"})
         found, said = self.filter_of(source, selection)

@@ -12,7 +12,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flats import Flats
+from beamline.projections.corrections.references import Flats
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from recon.prep.correct import Correction, merge_and_empty

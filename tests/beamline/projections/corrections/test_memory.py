@@ -12,18 +12,17 @@ import pytest
 
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.calibrate import Calibrate
-from beamline.projections.corrections.flags import Flags
-from beamline.projections.corrections.flats import Flats
+from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.hardening import Hardening
 from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.references import Flats
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.corrections.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
-from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slabs import Needs, needs_of

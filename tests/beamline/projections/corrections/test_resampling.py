@@ -15,8 +15,7 @@ from beamline.core.events import Event
 from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import CountModel
-from beamline.projections.corrections.defects import Defects
+from beamline.projections.corrections.counts import CountModel, Defects
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
