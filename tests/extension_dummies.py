@@ -63,6 +63,7 @@ import numpy as np
 import recon
 from click.testing import CliRunner
 from beamline.cli.method_options import takers
+from beamline.cli.options import Owner
 from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
 from beamline.reconstruct.outcome import label_of
@@ -81,7 +82,7 @@ assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers("iterations") and "grey" not in takers("tv_weight")
+assert "grey" in takers(Owner("iterations")) and "grey" not in takers(Owner("tv_weight"))
 assert label_of("grey") == "Grey"
 """,
 )

@@ -105,7 +105,7 @@ def study(
     lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
     if lengths:
         raise click.UsageError(f"--{lengths[0]} and --seconds exclude each other. Give one of them.")
-    settings = row_settings(methods, values)
+    settings = row_settings(click.get_current_context().command, methods, values)
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_{which}")
     options = StudyOptions(
