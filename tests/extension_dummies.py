@@ -350,11 +350,11 @@ assert wire.transmit() == b"0007"
 
 STEP = Extension(
     {
-        "beamline/projections/steps/lift.py": """
+        "beamline/projections/corrections/lift.py": """
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import StepDone, StepMemory, option
+from beamline.projections.step import StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -379,7 +379,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    (("beamline/projections/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
     """
 from pathlib import Path
 
@@ -388,9 +388,9 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.lift import Lift
-from beamline.projections.steps.registry import recorded
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.lift import Lift
+from beamline.projections.registry import in_order, recorded
 from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -400,7 +400,7 @@ with open_scan(SourceOptions(path)) as source:
     plain, lifted = (prepare_projections(source, each, print) for each in chosen)
 np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
 assert lifted.done["lift"].said == "Lifted by 0.5."
-found = recorded(chosen[1].in_order, lifted.done)
+found = recorded(in_order(chosen[1]), lifted.done)
 assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
 
 def run(*options):

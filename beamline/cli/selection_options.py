@@ -14,8 +14,9 @@ import click
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE, of_views, parsed, together
 from beamline.cli.scan_options import scan_options
-from beamline.projections.steps.registry import registered, steps_of
-from beamline.projections.steps.step import Option, PrepStep, options_of
+from beamline.projections.protocols import PrepStep
+from beamline.projections.registry import registered, steps_of
+from beamline.projections.step import Option, options_of
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection

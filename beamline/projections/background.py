@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.steps.air import Surface
+from beamline.projections.corrections.air import Surface
 from beamline.projections.truncation import cut_sides
 from recon.base.arrays import F32, F64, Mask
 from recon.base.binning import bin_views, factor_within

@@ -11,8 +11,9 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, at_once_memory
 from beamline.projections.poses import about, pivot_of
+from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection, geometry_of, rows_of
-from beamline.projections.steps.step import ScanPart, StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry

@@ -8,7 +8,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.projections.steps.hardening import Hardening
+from beamline.projections.corrections.hardening import Hardening
 from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry

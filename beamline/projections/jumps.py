@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection, at_once_memory
-from beamline.projections.flags import usable_views
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
+from beamline.projections.usable_views import usable_views
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64

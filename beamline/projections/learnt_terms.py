@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from recon.base.geometry import Geometry
 from recon.calibration import background, gains
 from recon.calibration.background import background_memory, learn_background

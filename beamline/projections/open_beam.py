@@ -10,6 +10,12 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
 from beamline.core.text import count
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.defects import Defects
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.flats import Flats
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.read import (
     current_scale,
     read_binned,
@@ -20,13 +26,7 @@ from beamline.projections.read import (
     with_dynamic_flats,
 )
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.defects import Defects
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.flats import Flats
-from beamline.projections.steps.references import ReferenceCheck
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
 from drivers.base.frame import FrameKind

@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.protocols import RayStep
+from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import RayStep, StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.pose_table import PoseTable
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -82,7 +84,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     geometry = geometry_of(source, selection, axis_col, source.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
-    for step in selection.in_order:
+    for step in in_order(selection):
         if isinstance(step, RayStep):
             geometry, _ = step.rays(source, selection, geometry)
     return geometry

@@ -15,17 +15,20 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.emission import prepare_emission
-from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PlaceStep, RayStep, ScanStep, ViewPlaces
+from beamline.projections.refusals import checked_views
+from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
+from beamline.projections.step import StepDone
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.projections.truncation import cut_said, cut_sides
+from beamline.projections.usable_views import UsableViews
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -141,7 +144,7 @@ def prepare_projections(
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     done = {**correction.done, **tilt, **places.done}
     found = replace(found, done=done)
-    steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
+    steps = [step for step in in_order(selection) if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(found, source.angles[ids], phases.progress)
         phases.progress(n, len(steps))
@@ -174,7 +177,7 @@ class _Places:
 
     def find(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
         """Let each step find the places of the views; those of `usable` that still can be used."""
-        for step in (step for step in self.selection.in_order if isinstance(step, PlaceStep)):
+        for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
             found = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = found
             if found.said:
@@ -194,7 +197,7 @@ class _Places:
         geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
         for found in self.moved.values():
             geometry = found.corrected(geometry, view_ids)
-        for step in (step for step in self.selection.in_order if isinstance(step, RayStep)):
+        for step in (step for step in in_order(self.selection) if isinstance(step, RayStep)):
             geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
         return geometry
 

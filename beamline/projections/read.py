@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
+from beamline.projections.corrections.defects import Defects
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.flats import Flats
 from beamline.projections.selection import Selection
-from beamline.projections.steps.defects import Defects
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.flats import Flats
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.base.frame import FrameKind

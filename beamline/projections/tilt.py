@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection, at_once_memory
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection, cone_of
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.phase import Phase
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt
@@ -65,14 +65,14 @@ def with_tilt(
     if uncertainty * rows > _MATTERS:
         warn(f"{said}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
     if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
-        return selection.having(replace(step, tilt=0.0)), f"{said}: not corrected."
-    return selection.having(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
+        return selection.with_steps(replace(step, tilt=0.0)), f"{said}: not corrected."
+    return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
 
 
 def search_memory(source: ScanSource, selection: Selection) -> int:
     """Bytes that `with_tilt` takes at most, if it is to find the tilt."""
     step, frames = selection.step(TiltAndLens), int((source.image_key == FrameKind.PROJECTION).sum())
-    steepest = replace(_plain(selection), rows=None).having(replace(step, tilt=math.degrees(STEEPEST)))
+    steepest = replace(_plain(selection), rows=None).with_steps(replace(step, tilt=math.degrees(STEEPEST)))
     n, cols = min(frames, _VIEWS), source.shape[1] // selection.binning
     rows = source.shape[0] // selection.binning
     middle = max(0, rows // 2 - _BAND_ROWS)
@@ -136,7 +136,7 @@ def _refined(
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = ScanCorrection(source, plain.having(replace(step, tilt=math.degrees(tilt))), lambda _: None)
+        levelled = ScanCorrection(source, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None)
         found = _look(source, levelled, frames, (_BANDS, _BAND_ROWS), _after(n * _BANDS, _ROUNDS * _BANDS, progress))
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
@@ -146,7 +146,7 @@ def _refined(
 
 def _plain(selection: Selection) -> Selection:
     """Without what blurs the views."""
-    return selection.having(Phase(), CountModel("log"))
+    return selection.with_steps(Phase(), CountModel("log"))
 
 
 def _after(before: int, total: int, progress: BandsDone) -> BandsDone:

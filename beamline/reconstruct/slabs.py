@@ -15,13 +15,15 @@ from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import ScanPart
+from beamline.projections.registry import in_order
 from beamline.projections.selection import choose_views, cone_of, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import ScanPart, StepMemory
+from beamline.projections.step import StepMemory
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -182,7 +184,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     pixel = pixel if source.emission is None else _EMISSION
     needs = Needs.of(options.method, views, shape, pixel, axis)
     part = ScanPart(source, selection, needs.geometry)
-    stated = {step.name: step.memory(part) for step in selection.in_order}
+    stated = {step.name: step.memory(part) for step in in_order(selection)}
     return replace(
         needs,
         method=options.method_for(needs.geometry),

@@ -10,10 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from beamline.cli.main import main
+from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.calibrate import Calibrate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.test_air import bent_and_straight
@@ -112,7 +112,7 @@ def test_views_held_out_lose_the_surface_of_their_time(scans: dict[str, Path]) -
         plain = Selection(axis_col=55.5, binning=2, views="fixed:40")
         found, before = (
             prepare_projections(source, selection, lambda said: None)
-            for selection in (plain.having(Calibrate(("background",))), plain)
+            for selection in (plain.with_steps(Calibrate(("background",))), plain)
         )
     assert found.held_out is not None and before.held_out is not None
     taken = before.held_out[0] - found.held_out[0]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind

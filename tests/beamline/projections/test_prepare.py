@@ -12,10 +12,10 @@ import pytest
 import recon
 from beamline.core.errors import DataError
 from beamline.projections import axis as axis_module
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.projections.tilt import spread_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np

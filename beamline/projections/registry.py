@@ -8,10 +8,12 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import PlaceStep, PrepStep, RayStep, ScanStep, StepDone, ViewStep, options_of
+from beamline.projections.protocols import PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
+from beamline.projections.step import StepDone, key_of, options_of
 from drivers.plugins import plugins
 
 if TYPE_CHECKING:
+    from beamline.projections.selection import Selection
     from beamline.storage.writers.recon_file import Value
 
 REGISTRY: dict[str, str] = {
@@ -30,14 +32,14 @@ REGISTRY: dict[str, str] = {
     "rings": "Rings",
     "hardening": "Hardening",
 }
-"""Module in this folder, and its class; options stand in this order."""
+"""Module in `corrections`, and its class; options stand in this order."""
 
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
     """Every step, in the order of the registry; those of other packages come last."""
     ours: list[type[PrepStep]] = [
-        getattr(import_module(f"beamline.projections.steps.{module}"), cls) for module, cls in REGISTRY.items()
+        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for module, cls in REGISTRY.items()
     ]
     names = {step.name for step in ours}
     taken = {option.name for step in ours for option in options_of(step).values()}
@@ -64,6 +66,11 @@ def all_steps() -> tuple[type[PrepStep], ...]:
     return tuple(by_name[name] for name in order)
 
 
+def in_order(selection: Selection) -> list[PrepStep]:
+    """Every step that there is as the selection has it, each after those that it follows."""
+    return [selection.step(kind) for kind in all_steps()]
+
+
 def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
     """All steps with these values of their options, which are keyed as `key_of` says.
 
@@ -74,11 +81,6 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
         step(**{field: values[key_of(option.name)] for field, option in options_of(step).items()})
         for step in registered()
     )
-
-
-def key_of(option: str) -> str:
-    """The name of an option's value among those of a command."""
-    return option.lstrip("-").replace("-", "_")
 
 
 def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:

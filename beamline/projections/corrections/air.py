@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np

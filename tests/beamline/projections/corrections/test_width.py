@@ -12,10 +12,10 @@ import pytest
 import recon
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warnings
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.step import StepDone, options_of
-from beamline.projections.steps.width import Width
+from beamline.projections.step import StepDone, options_of
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
@@ -117,12 +117,12 @@ def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
 
 @pytest.mark.parametrize("term", ["roll", "tilt"])
 def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: str) -> None:
-    learnt = Selection().having(Calibrate((term,)))
+    learnt = Selection().with_steps(Calibrate((term,)))
     _, after, done = _rays(Width(), _source(), learnt)
     assert after.width.arc > 0 and after.skew == 0 and done.parameters["readout_arc_deg"] == 0
     with pytest.raises(ConfigError, match="calibrated"):
         _rays(Width(arc="1:0.1"), _source(), learnt)
-    assert _rays(Width(), _source(), Selection().having(Calibrate(("axis", "shifts"))))[1].skew > 0
+    assert _rays(Width(), _source(), Selection().with_steps(Calibrate(("axis", "shifts"))))[1].skew > 0
 
 
 @pytest.mark.parametrize(

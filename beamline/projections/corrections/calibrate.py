@@ -8,7 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import DataError
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np

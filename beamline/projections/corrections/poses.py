@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory, ViewPlaces, option
+from beamline.projections.protocols import ScanPart, ViewPlaces
+from beamline.projections.step import StepMemory, option
 
 if TYPE_CHECKING:
-    from beamline.projections.flags import UsableViews
     from beamline.projections.selection import Selection
+    from beamline.projections.usable_views import UsableViews
     from beamline.storage.pose_table import PoseTable
     from beamline.storage.readers.base import ScanSource
 

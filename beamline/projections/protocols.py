@@ -1,84 +1,27 @@
-"""What a step is: a correction of views with its options, its place among the others, and what it says it did.
+"""What a step can do: a filter of each view, a search for where the sample was, a change of the rays, or of all views.
 
-A step is a frozen dataclass. A field made by `option` is an option of the commands, of a recipe and of Python alike. A
-module of a step is imported for every help text: what computes is imported where it is called.
+A plug-in meets one of `ViewStep`, `PlaceStep`, `RayStep` and `ScanStep`. The module of a step is imported for every
+help text: what reads files or needs numba, torch or scipy is imported where it is called.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+from beamline.projections.step import NamedStep, StepDone, StepMemory
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.flags import UsableViews
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.selection import Selection
+    from beamline.projections.usable_views import UsableViews
     from beamline.storage.readers.base import ScanSource
-    from beamline.storage.writers.recon_file import Value
     from recon.base.geometry import Geometry
     from recon.prep.correct import Projections
-
-
-@dataclass(frozen=True)
-class Option:
-    """An option of a step on the command line.
-
-    Attributes:
-        name: with its dashes.
-        help: for people.
-        default: as it would be typed; None: there is nothing to type.
-        parse: what is typed to the value of the field; its ValueError is bad usage.
-        choices: what may be typed; empty: anything that `parse` takes.
-        metavar: what stands for the value in help.
-        path: it names a file.
-    """
-
-    name: str
-    help: str
-    default: str | None = None
-    parse: Callable[[str], Any] = str
-    choices: tuple[str, ...] = ()
-    metavar: str | None = None
-    path: bool = False
-
-
-def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
-    """A field of a step that the option `name` sets; `rest` is as of `Option`. Its default is that of the option."""
-    made = Option(name, help, default, **rest)
-    return field(default=None if default is None else made.parse(default), metadata={"option": made})
-
-
-def options_of(step: type[PrepStep]) -> dict[str, Option]:
-    """The options of a step, by field."""
-    return {each.name: each.metadata["option"] for each in fields(step) if "option" in each.metadata}  # type: ignore[arg-type]
-
-
-def positive(text: str) -> float:
-    """A finite number above 0. ValueError for anything else."""
-    number = float(text)
-    if not 0 < number < math.inf:
-        raise ValueError(f"{text} is not in the range x>0")
-    return number
-
-
-@dataclass(frozen=True, eq=False)
-class StepDone:
-    """What a step did.
-
-    Attributes:
-        said: a sentence; empty where nothing was asked, or nothing found.
-        parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
-        warned: a warning told it.
-    """
-
-    said: str = ""
-    parameters: Mapping[str, Value] | None = None
-    warned: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,36 +36,14 @@ class ScanPart:
     selection: Selection
     geometry: Geometry
 
-
-@dataclass(frozen=True)
-class StepMemory:
-    """Bytes that a step takes at most, beside raw pixels, line integrals and volume.
-
-    Attributes:
-        correcting: while views are corrected, a batch at a time.
-        alone: before or after that.
-    """
-
-    correcting: int = 0
-    alone: int = 0
-
-    @classmethod
-    def of_all(cls, steps: Iterable[StepMemory]) -> StepMemory:
-        """That of all steps, which act one after the other."""
-        found = list(steps)
-        return cls(max(each.correcting for each in found), max(each.alone for each in found))
+    def view_bytes(self, reach: int = 0) -> int:
+        """Bytes of a float32 view, with so many rows on either side as far as the detector has them."""
+        rows, cols = self.geometry.detector_shape
+        return 4 * min(rows + 2 * reach, self.source.shape[0] // self.selection.binning) * cols
 
 
-class PrepStep(Protocol):
-    """A correction. Its ValueError on creation is bad usage.
-
-    Attributes:
-        name: by which events and `PreparedProjections.done` know it.
-        follows: names of steps that come before it.
-    """
-
-    name: ClassVar[str]
-    follows: ClassVar[tuple[str, ...]]
+class PrepStep(NamedStep, Protocol):
+    """A correction. Its ValueError on creation is bad usage."""
 
     @property
     def needs_finished(self) -> str:
@@ -134,12 +55,6 @@ class PrepStep(Protocol):
         Raises:
             ConfigError: the step does not fit the scan.
         """
-
-
-def view_bytes(part: ScanPart, reach: int = 0) -> int:
-    """Bytes of a float32 view, with so many rows on either side as far as the detector has them."""
-    rows, cols = part.geometry.detector_shape
-    return 4 * min(rows + 2 * reach, part.source.shape[0] // part.selection.binning) * cols
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,13 +14,13 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.defects import Defects
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.defects import Defects
-from beamline.projections.steps.resampling import TiltAndLens
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion
@@ -77,11 +77,11 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
     straight, said = _prepared(_source(0.0), SELECTION)
     assert not said and _tilt(straight) == ("", 0)
     as_it_is, _ = _prepared(_source(1.5), SELECTION)
-    levelled, said = _prepared(_source(1.5), SELECTION.having(TiltAndLens("auto")))
+    levelled, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens("auto")))
     assert (
         not said and _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
     )
-    given, _ = _prepared(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).having(TiltAndLens(1.5)))
+    given, _ = _prepared(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
     for found in (levelled, given):
         assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)
         assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
@@ -92,7 +92,7 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
 def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> None:
     events: list[Event] = []
     phases = Phases(events.append, SimpleNamespace(now=itertools.count(0.0, 1.0).__next__))
-    source, selection = _source(1.5), SELECTION.having(TiltAndLens("auto"))
+    source, selection = _source(1.5), SELECTION.with_steps(TiltAndLens("auto"))
     prepare_projections(source, selection, lambda text: None, phases=phases)  # type: ignore[arg-type]
     told = [(event.data["phase"], event.data["n"], event.data["of"]) for event in events if event.data["n"]]
     bands = [n for phase, n, _ in told if phase == "tilt and references"]
@@ -103,15 +103,15 @@ def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> Non
 
 def test_no_tilt_changes_nothing() -> None:
     plain, _ = _prepared(_source(1.5), SELECTION)
-    zero, said = _prepared(_source(1.5), SELECTION.having(TiltAndLens(0.0)))
+    zero, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
     assert not said and _tilt(zero)[0] == "" and zero.measured is None
     np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
-    found, said = _prepared(_source(0.0), SELECTION.having(TiltAndLens("auto")))
+    found, said = _prepared(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
     assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
 
 
 def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
-    prepared, _ = _prepared(_source(0.0), replace(SELECTION, axis_col=49.3).having(TiltAndLens(5.0)))
+    prepared, _ = _prepared(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
     assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
     assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
     weights = prepared.ray_weights()
@@ -137,9 +137,9 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
 def test_what_cannot_be_levelled_is_refused() -> None:
     source = _source(0.0)
     with pytest.raises(ConfigError, match="--tilt is for a parallel beam; array is a cone"):
-        _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).having(TiltAndLens(1.0)))
+        _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion mix neighbouring pixels"):
-        _prepared(source, SELECTION.having(TiltAndLens(1.0), CountModel("counts")))
+        _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), CountModel("counts")))
     few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
     with pytest.raises(DataError, match="the tilt of the axis was not found"):
-        _prepared(few, replace(SELECTION, axis_col=49.3).having(TiltAndLens("auto")))
+        _prepared(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

@@ -10,20 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.projections.flags import usable_views
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.flats import Flats
+from beamline.projections.corrections.hardening import Hardening
+from beamline.projections.corrections.jumps import Jumps
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.corrections.rings import Rings
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.flats import Flats
-from beamline.projections.steps.hardening import Hardening
-from beamline.projections.steps.jumps import Jumps
-from beamline.projections.steps.phase import Phase
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.rings import Rings
-from beamline.projections.steps.step import PrepStep, ScanPart, ScanStep, StepMemory, ViewStep
+from beamline.projections.step import StepMemory
 from beamline.projections.tilt import with_tilt
+from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slabs import Needs, needs_of
@@ -34,7 +35,7 @@ from recon.prep.correct import Projections
 from recon.prep.dynamic_flats import DynamicFlats, find_dynamic_flats, search_memory, view_memory
 from recon.prep.resample import Distortion
 from recon.voxels.direct import Fbp
-from tests.beamline.projections import test_jumps as of_jumps
+from tests.beamline.projections.corrections import test_jumps as of_jumps
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 LENS = Distortion.parse("xcenter = 80\nycenter = 120\nfactor0 = 1.0\nfactor1 = 2e-5\n")

@@ -12,12 +12,12 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.digest import digest
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.poses import PosesOfFile
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.poses import PosesOfFile
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo

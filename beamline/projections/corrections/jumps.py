@@ -6,12 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepMemory, option
 
 if TYPE_CHECKING:
-    from beamline.projections.flags import UsableViews
     from beamline.projections.jumps import SamplePlaces
     from beamline.projections.selection import Selection
+    from beamline.projections.usable_views import UsableViews
     from beamline.storage.readers.base import ScanSource
 
 
@@ -47,8 +48,8 @@ class Jumps:
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> SamplePlaces:
+        from beamline.projections.corrections.poses import stated_poses
         from beamline.projections.jumps import SamplePlaces, find_jumps, frames_text
-        from beamline.projections.steps.poses import stated_poses
 
         if stated_poses(source, selection) is not None:  # it states where the sample was
             return SamplePlaces(usable.frames)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepMemory, option
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import source_findings
 from drivers.base.frame import FrameKind
@@ -19,7 +19,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
-ACCEPT = SELECTION.having(ReferenceCheck("accept"))
+ACCEPT = SELECTION.with_steps(ReferenceCheck("accept"))
 FULL = 65535.0
 
 

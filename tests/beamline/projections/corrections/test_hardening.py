@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from beamline.projections.corrections.hardening import Hardening
 from beamline.projections.hardening import curve_of
-from beamline.projections.steps.hardening import Hardening
 from recon.base.geometry import Geometry
 from simulators.effects.beam_hardening import BeamHardening
 from simulators.frame.detector import Detector

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.rings import Rings
+from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.phase import Phase
-from beamline.projections.steps.registry import all_steps, key_of, recorded, registered, steps_of
-from beamline.projections.steps.rings import Rings
-from beamline.projections.steps.step import StepDone, options_of
+from beamline.projections.step import StepDone, key_of, options_of
 
 
 def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:
@@ -33,10 +33,10 @@ def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
 
 
 def test_a_selection_takes_one_step_of_a_kind() -> None:
-    selection = Selection(steps=(Rings("sort"),)).having(Air("none"), Rings("vo"))
+    selection = Selection(steps=(Rings("sort"),)).with_steps(Air("none"), Rings("vo"))
     assert selection.steps == (Air("none"), Rings("vo"))
     assert (selection.step(Rings).way, selection.step(Phase)) == ("vo", Phase())
-    assert [step.name for step in selection.in_order] == [step.name for step in all_steps()]
+    assert [step.name for step in in_order(selection)] == [step.name for step in all_steps()]
 
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:

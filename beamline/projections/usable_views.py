@@ -1,33 +1,29 @@
-"""Usable views of a scan: what refuses all of them, and which views, or rays of them, its flags give less weight."""
+"""Usable views of a scan: which views the flags of the monitor leave out, and which views or rays weigh less."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
-from beamline.core.sinks import Warn
 from beamline.core.text import count
-from beamline.projections.replay import judged_flags
-from beamline.projections.selection import Selection
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.flags import frames_flagged
-from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.treatment import boxes_of, flagged_in_part, treatment_of
-from beamline.storage.rules.validate import quantity_said, references_present, scan_ended, scan_findings
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.binning import bin_views
 from recon.prep.resample import Resampling
 
-WARNED_SHARE = 0.5  # Weight of a ray in the region of a warning
+WARNED_SHARE = 0.5
+"""Weight of a ray in the region of a warning."""
+WARNED_WEIGHT = 0.5
+"""Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more
+than noise, not that it is wrong, and there are too few views to do without it."""
+WIDE = 2.5
+"""A gap between the remaining views is reported when it is this many times the widest gap before: two neighbouring
+views are missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +97,6 @@ def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
     )
 
 
-WARNED_WEIGHT = 0.5
-"""Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more
-than noise, not that it is wrong; views are too few to do without."""
-WIDE = 2.5
-"""Times the widest gap between the views taken, from which a gap between those left is told: two neighbours went."""
-
-
 @dataclass(frozen=True, eq=False)
 class UsableViews:
     """The views of a scan that a reconstruction may use.
@@ -174,44 +163,6 @@ def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.in
     period = np.pi if source.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
-
-
-def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
-    """The views of a finished scan that may be used, by the flags of the monitor.
-
-    What else its file lacks is told as a warning, also what its flags mean for this scan.
-
-    Raises:
-        DataError: it cannot be reconstructed; with every reason, and what to do about each.
-    """
-    flags = selection.step(Flags)
-    judged = judged_flags(source) if flags.judged and source.finished else None
-    accepted = selection.step(ReferenceCheck).accepted
-    findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, accepted)]
-    if flags.used:
-        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
-    refuse(source, findings)
-    usable = usable_views(source, flags.used, judged)
-    if usable.said:
-        warn(usable.said)
-    for finding in findings:
-        if finding.severity == "warning":
-            warn(finding.message)
-    return usable
-
-
-def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
-    """Raises DataError for the errors among the findings, with what to do about each."""
-    reasons = [finding.message for finding in findings if finding.severity == "error"]
-    if reasons:
-        raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
-
-
-def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
-    """Why the frames of a scan that is still growing cannot be corrected."""
-    checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
-    rules = (quantity_said, references_present, *checked)
-    return [finding for rule in rules for finding in rule(source)]
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from beamline.core.errors import ConfigError
 from beamline.core.files import text_in
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, view_bytes
+from beamline.projections.protocols import ScanPart, ViewFilter
+from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -97,7 +98,7 @@ class TiltAndLens:
             return StepMemory()
         copies = 17 if self.distortion is None else 26
         search = search_memory(part.source, part.selection) if self.sought else 0
-        return StepMemory(copies * view_bytes(part, found.reach), search)
+        return StepMemory(copies * part.view_bytes(found.reach), search)
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."

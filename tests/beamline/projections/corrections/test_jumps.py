@@ -13,12 +13,12 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.jumps import Jumps
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock

@@ -9,10 +9,10 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase import Phase
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.phase import Phase
 from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK
@@ -52,7 +52,7 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
     np.testing.assert_allclose(band, whole[:, 20 // binning : 28 // binning], atol=0.01)
     narrow = _correction(selection).at_once(frames, slice(4, 6)).data
     np.testing.assert_allclose(narrow, whole[:, 4:6], atol=0.01)
-    assert whole.std() < 0.5 * _correction(selection.having(Phase())).at_once(frames).data.std()
+    assert whole.std() < 0.5 * _correction(selection.with_steps(Phase())).at_once(frames).data.std()
 
 
 def test_what_the_file_does_not_say_is_asked_for() -> None:
@@ -66,7 +66,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     with pytest.raises(ConfigError, match=r"filter over 702.4 pixels; array has 48 x 40"):
         replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
-        _correction(SELECTION.having(CountModel("counts")))
+        _correction(SELECTION.with_steps(CountModel("counts")))
 
 
 def test_a_cone_is_scaled_to_the_sample() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option, positive
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepMemory, option, positive
 from recon.base.choices import FEW_PHOTONS, Noise
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option, view_bytes
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepMemory, option
 from drivers.base.frame import FrameKind
 from recon.base.choices import FlatFields
 
@@ -42,5 +43,5 @@ class Flats:
             return StepMemory()
         from recon.prep.dynamic_flats import search_memory, view_memory
 
-        pixels, flats = view_bytes(part) // 4, int((part.source.image_key == FrameKind.FLAT).sum())
+        pixels, flats = part.view_bytes() // 4, int((part.source.image_key == FrameKind.FLAT).sum())
         return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 from recon.base.choices import Rings as Way
 
 if TYPE_CHECKING:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepMemory, option
 
 
 @dataclass(frozen=True)
 class Flags:
-    """How flags are heeded. `beamline.projections.flags` chooses the views, `jumps` corrects them.
+    """How flags are heeded. `beamline.projections.usable_views` chooses the views, `jumps` corrects them.
 
     Attributes:
         wanted: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, positive, view_bytes
+from beamline.projections.protocols import ScanPart, ViewFilter
+from beamline.projections.step import StepDone, StepMemory, option, positive
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -102,10 +103,10 @@ class Phase:
         if self.material is None:
             return StepMemory()
         found, _ = self.filter_of(part.source, part.selection)
-        return StepMemory((7 if self.unsharp is None else 9) * view_bytes(part, found.reach))
+        return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(found.reach))
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
-        from beamline.projections.steps.defects import Defects
+        from beamline.projections.corrections.defects import Defects
 
         if self.material is None:
             return None, StepDone("", {"phase": "not retrieved"})
