@@ -38,11 +38,19 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
-from recon.base.method import BoundedMethod, CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
+from recon.base.method import (
+    BoundedMethod,
+    CheckpointedMethod,
+    DataUse,
+    Method,
+    Progress,
+    Reconstruction,
+    RunControl,
+    candidates_of,
+)
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
-from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
 from recon.splatting.fit_method import FitMethod
 from recon.warm_up import warm_up
