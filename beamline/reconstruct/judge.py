@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext
+from beamline.reconstruct.outcome import ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
     hiding_warning,
@@ -24,6 +24,7 @@ from beamline.reconstruct.remarks import (
 from beamline.storage.scratch import scratch_array
 from drivers.base.clock import Clock
 from recon.assess.lost_mass import compare
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
@@ -58,7 +59,7 @@ class JudgedVolume:
 
 
 def judge(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -103,7 +104,7 @@ def judge(
 class _Judging:
     """The looks at one volume, in their order, with what they found so far."""
 
-    made: ReconOutcome
+    made: Reconstruction
     prepared: PreparedProjections
     truth: Volume | None
     target: OutputPaths
@@ -199,7 +200,7 @@ class _Judging:
         before = self.clock.now()
         grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
         out = scratch_array(self.target.output.parent, grid.shape) if on_disk else None
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.progress, out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, self.context.filter, phases.progress, out)
         fbp = Volume(data, grid)
         self.volumes = {BASELINE: fbp, **self.volumes}
         self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}

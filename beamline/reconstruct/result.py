@@ -11,16 +11,17 @@ from beamline.core.files import remove
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.judge import judge
 from beamline.reconstruct.model import arrays_of_model
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, label_of
+from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.recon_report import compose
 from beamline.report.html import write_report
-from beamline.report.record import history_arrays
+from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.partial_volume import complete
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
+from recon.base.method import Reconstruction
 from recon.base.volume import Volume
 from recon.methods import BASELINE
 
@@ -28,7 +29,7 @@ _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an out
 
 
 def write_result(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -93,6 +94,7 @@ def write_result(
         raise
     phases.end()
     said: dict[str, Any] = {name: made.settings[name] for name in _ENDS if name in made.settings}
+    price = price_of_decibel(made)
     sink(
         VolumeDone(
             output=target.output,
@@ -107,9 +109,9 @@ def write_result(
             metrics=own,
             **said,
             hiding=judged.hiding or None,
-            chosen=made.chosen or None,
-            next_db=made.next_decibel,
-            next_db_said=None if made.next_decibel is None else made.next_decibel_text,
+            chosen=context.chosen or None,
+            next_db=price,
+            next_db_said=None if price is None else price_text(made),
             fbp=judged.metrics[BASELINE] if len(judged.metrics) > 1 else None,
             time=clock.now(),
         )

@@ -127,6 +127,7 @@ class Reconstruction:
         checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
         method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
         seconds: wall time of the reconstruction, which the caller of `run` measures.
+        deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
     """
 
     volume: Volume
@@ -136,6 +137,7 @@ class Reconstruction:
     checkpoint: Mapping[str, NDArray[Any]] | None = None
     method: str = ""
     seconds: float = 0.0
+    deviation: Volume | None = None
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
