@@ -58,7 +58,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     if not as_json:
         done = last[-1]
         assert isinstance(done, VolumeDone)
-        click.echo(f"{'folder':<10}{done.output.parent}\n{results(done)}")
+        click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
 
 
 @contextmanager

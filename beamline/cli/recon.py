@@ -371,10 +371,10 @@ def recon(
     done = last[-1]
     assert isinstance(done, VolumeDone)
     if not as_json:
-        click.echo(results(done))
-    if done.checkpoint_lost:
-        raise DataError(f"The last checkpoint was left out: {done.checkpoint_lost} The volume is in {output}.")
-    if done.ended_early:
+        click.echo(results(done.record))
+    if lost := done.record.parameters.get("checkpoint_lost"):
+        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
+    if done.record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:
         require(metrics, max_residual)
