@@ -29,7 +29,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import MethodResult, Traits
+from recon.base.method import Reconstruction, Traits
 from recon.base.volume import Volume
 
 
@@ -42,7 +42,7 @@ class Grey:
     shade: float = 0.5
 
     def run(self, problem, control):
-        return MethodResult(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
+        return Reconstruction(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
 
     def toy(self):
         return self

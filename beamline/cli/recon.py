@@ -187,10 +187,10 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
     done, output = last[-1], options.target.output
     assert isinstance(done, VolumeDone)
     if not values["as_json"]:
-        click.echo(results(done))
-    if done.checkpoint_lost:
-        raise DataError(f"The last checkpoint was left out: {done.checkpoint_lost} The volume is in {output}.")
-    if done.ended_early:
+        click.echo(results(done.record))
+    if lost := done.record.parameters.get("checkpoint_lost"):
+        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
+    if done.record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if values["max_residual"] is not None:
         require(metrics, values["max_residual"])
