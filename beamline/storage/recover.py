@@ -264,15 +264,21 @@ def _rows_readable(file: h5py.File) -> int:
     """Number of rows from the first on whose columns and pixels can be read, up to the last that is as written."""
     n = int(file[layout.COMMITTED][()])
     for path in layout.GROWING:
-        n = min(n, len(file[path]))
-        while n and not _reads(file[path], slice(n)):
-            n -= 1
-    for row in range(n):
-        if not all(row < len(file[path]) and _reads(file[path], row) for path in (layout.DATA, layout.PREVIEW)):
-            n = row
-            break
+        n = _most_rows(file[path], n)
+    images = file[layout.DATA], file[layout.PREVIEW]
+    n = min(n, *map(len, images))
+    n = next((row for row in range(n) if not all(_reads(item, row) for item in images)), n)
     good = np.setdiff1d(np.arange(n), altered_rows(file, 0, n))
     return int(good[-1]) + 1 if good.size else 0
+
+
+def _most_rows(column: h5py.Dataset, most: int) -> int:
+    """Number of rows from the first on that can be read, `most` at most: those of a readable part can be, too."""
+    least, most = 0, min(most, len(column))
+    while least < most:
+        half = (least + most + 1) // 2
+        least, most = (half, most) if _reads(column, slice(half)) else (least, half - 1)
+    return least
 
 
 def _reads(item: h5py.Dataset, rows: slice | int) -> bool:
