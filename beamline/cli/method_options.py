@@ -92,16 +92,16 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
 
 def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
     """NAME=VALUE, several in one text apart by spaces, as a value by name: JSON, or else text."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")
         if not (name and equals and text):
             raise click.BadParameter(f"{word!r} is no setting; expected NAME=VALUE, such as fit.decay=0.1")
         try:
-            found[name] = json.loads(text)
+            settings[name] = json.loads(text)
         except ValueError:
-            found[name] = text
-    return found
+            settings[name] = text
+    return settings
 
 
 def preset_of(method: str | None, preset: str | None) -> str | None:

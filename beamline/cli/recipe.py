@@ -33,14 +33,14 @@ class Repeatable(click.Command):
 
 def given(ctx: click.Context) -> dict[click.Option, Any]:
     """The options that the user gave, on the command line or in a recipe, as they were typed there."""
-    found = {}
+    typed = {}
     for param in ctx.command.params:
         source = ctx.get_parameter_source(param.name or "")
         if isinstance(param, click.Option) and source == ParameterSource.COMMANDLINE:
-            found[param] = ctx.meta[_RAW][param.name]
+            typed[param] = ctx.meta[_RAW][param.name]
         elif isinstance(param, click.Option) and source == ParameterSource.DEFAULT_MAP:
-            found[param] = (ctx.default_map or {})[param.name]
-    return found
+            typed[param] = (ctx.default_map or {})[param.name]
+    return typed
 
 
 def _is_of_one_call(option: click.Option) -> bool:
@@ -131,31 +131,31 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
         for option in ctx.command.params
         if isinstance(option, click.Option) and not _is_of_one_call(option)
     }
-    found: dict[str, Any] = {}
-    for name, said in _read(value).items():
+    defaults: dict[str, Any] = {}
+    for name, text in _read(value).items():
         if name not in options:
             raise click.BadParameter(f"{value}: {name!r} is no option of a recipe; expected {', '.join(options)}")
-        if not isinstance(said, str) or not said:
+        if not isinstance(text, str) or not text:
             raise click.BadParameter(
                 f"{value}: {name} holds no text or several; expected one value, as on the command line"
             )
         option = options[name]
-        found[str(option.name)] = said.split() if option.multiple else said
-    ctx.default_map = found
+        defaults[str(option.name)] = text.split() if option.multiple else text
+    ctx.default_map = defaults
 
 
 def _read(path: Path) -> Mapping[str, Any]:
     """The content of a recipe, all values as text: YAML's own rules would turn 61:04 into 3664."""
     try:
         text = _text(path)
-        said = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
+        content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(said, dict):
+    if not isinstance(content, dict):
         raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
-    return said
+    return content
 
 
 def _text(path: Path) -> str:

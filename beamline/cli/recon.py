@@ -27,7 +27,7 @@ from beamline.cli.options import (
 from beamline.cli.recipe import given, recipe_text, repeating
 from beamline.cli.recon_options import SHEET, recon_options
 from beamline.cli.recon_time import recon_series
-from beamline.cli.selection_options import chosen, steps_said
+from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
@@ -116,7 +116,7 @@ def _checked_method(context: click.Context, method: str | None, axes: AxisRange 
         method = DEFAULT if of_fits else AUTO
     refuse_contradictions(context.command, names_given, {"axis_trials": "--axis try", "slabs": f"--resume {slabs}"})
     refuse_for_method(context, method, names_given)
-    for step in steps_said(values) if values["follow"] else ():
+    for step in chosen_steps(values) if values["follow"] else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
     return method
@@ -212,10 +212,10 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:
-        found = estimate(options, clock)
-        sink(Done(found, time=clock.now()))
+        needs = estimate(options, clock)
+        sink(Done(needs, time=clock.now()))
     if not as_json:
-        click.echo("\n".join(found.lines()))
+        click.echo("\n".join(needs.lines()))
 
 
 def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: bool) -> None:

@@ -87,16 +87,16 @@ def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOpti
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
         cone=values["cone"],
         seed=seed,
-        steps=steps_said(values),
+        steps=chosen_steps(values),
     )
     facts = {field.name: values[field.name] for field in fields(SourceOptions) if field.name in values}
     return SourceOptions(file, **facts), selection
 
 
-def steps_said(said: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """The steps for the options in `said`."""
+def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
+    """The steps for the options in `values`."""
     try:
-        return steps_of(said)
+        return steps_of(values)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
 
