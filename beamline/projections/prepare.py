@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,26 +13,25 @@ from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.calibrate import Calibrate
-from beamline.projections.corrections.poses import stated_poses
-from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.corrections.poses import poses_of, require_known, stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.emission import prepare_emission
-from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import PlaceStep, RayStep, ScanStep, ViewPlaces
+from beamline.projections.protocols import ScanStep
 from beamline.projections.refusals import checked_views
 from beamline.projections.registry import in_order
-from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.step import StepDone
-from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
+from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
+from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.truncation import cut_said, cut_sides
 from beamline.projections.usable_views import UsableViews
+from beamline.projections.view_geometry import ViewGeometry
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
+from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -43,7 +42,7 @@ _HELD_OUT_VIEWS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Spill:
+class DiskBuffer:
     """Line integrals on disk instead of in memory, for work in slabs.
 
     Attributes:
@@ -61,7 +60,7 @@ def prepare_projections(
     source: ScanSource,
     selection: Selection,
     warn: Warn,
-    spill: Spill | None = None,
+    buffer: DiskBuffer | None = None,
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
@@ -71,8 +70,8 @@ def prepare_projections(
         source: a finished scan.
         selection: what to use.
         warn: is told, in a sentence, of everything that is not as it should be though work goes on.
-        spill: where line integrals lie. Rays that were not measured, or weigh nothing by the flags, are filled there as
-            a direct method does it, and `shares` is None.
+        buffer: on disk, takes the line integrals; None: they stay in memory. Rays that were not measured, or weigh
+            nothing by the flags, are interpolated there, and `shares` is None.
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
         phases: is told what is done, one after the other.
@@ -82,7 +81,7 @@ def prepare_projections(
         ConfigError: the selection does not fit the scan.
     """
     if (emission := source.emission) is not None:
-        if spill is not None:
+        if buffer is not None:
             raise DataError(
                 f"{source.path}: counts of an emission have to be in memory. Give more --memory, or --rows."
             )
@@ -99,28 +98,28 @@ def prepare_projections(
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
-    if poses is None:
-        warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
+    if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
+        warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     _warn_of_other_axis(source, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
-    places = _Places(source, selection, axis_col)
-    usable = places.find(usable, warn, phases)
-    chosen = choose_views(source, usable.frames, selection, places.of(usable.frames).period)
+    view_geometry = ViewGeometry(source, selection, axis_col)
+    usable = view_geometry.find_motion(usable, warn, phases)
+    chosen = choose_views(source, usable.frames, selection, view_geometry.of(usable.frames).period)
     wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
     if poses is not None:
         require_known(poses, source, selection, wanted)
         rest = rest[poses.known(rest)]
     others_ids = spread(rest, _HELD_OUT_VIEWS)
-    places.calibrate(np.union1d(wanted, others_ids), phases)
+    view_geometry.calibrate(np.union1d(wanted, others_ids), phases)
     if check is not None:
-        check(places.of(wanted))
+        check(view_geometry.of(wanted))
     phases.enter("correction")
-    if spill is None:
+    if buffer is None:
         projections = correction.at_once(wanted, progress=phases.progress)
     else:
-        projections = correction.in_batches(wanted, spill.views, spill.batch, spill.progress)
+        projections = correction.in_batches(wanted, buffer.views, buffer.batch, buffer.progress)
     if 2 * projections.view_ids.size < wanted.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {wanted.size} views can be used; the others have no "
@@ -132,17 +131,17 @@ def prepare_projections(
     with suppress(NoViewError):  # those held out may all be without light
         others = correction.at_once(others_ids) if rest.size else None
     ids = projections.view_ids
-    on_disk, column = spill is not None, places.axis_col
-    found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)
+    on_disk, column = buffer is not None, view_geometry.axis_col
+    found = assemble(source, selection, projections, view_geometry.of(ids), (column, axis), usable, warn, on_disk)
     if others is not None:
         found = replace(
             found,
-            held_out=(others.data, places.of(others.view_ids)),
+            held_out=(others.data, view_geometry.of(others.view_ids)),
             held_out_ids=others.view_ids,
             held_out_weights=others.weights,
         )
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
-    done = {**correction.done, **tilt, **places.done}
+    done = {**correction.done, **tilt, **view_geometry.done}
     found = replace(found, done=done)
     steps = [step for step in in_order(selection) if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
@@ -151,60 +150,6 @@ def prepare_projections(
     if on_disk:
         _fill_unknown(found)
     return found
-
-
-@dataclass(eq=False)
-class _Places:
-    """Where the views see the sample from: the stated angles, and what steps find out and change."""
-
-    source: ScanSource
-    selection: Selection
-    stated_axis: float
-    moved: dict[str, ViewPlaces] = field(default_factory=dict)
-    rays: dict[str, StepDone] = field(default_factory=dict)
-    learnt: Calibrated | None = None
-
-    @property
-    def axis_col(self) -> float:
-        """The column of the rotation axis."""
-        return self.stated_axis if self.learnt is None else self.stated_axis + self.learnt.axis
-
-    @property
-    def done(self) -> dict[str, StepDone]:
-        """What the steps did, by their names."""
-        calibrated = {} if self.learnt is None else {self.selection.step(Calibrate).name: self.learnt.done}
-        return {**{name: places.done for name, places in self.moved.items()}, **self.rays, **calibrated}
-
-    def find(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
-        """Let each step find the places of the views; those of `usable` that still can be used."""
-        for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
-            found = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
-            self.moved[step.name] = found
-            if found.said:
-                warn(found.said)
-            usable = usable.only(found.frames)
-        return usable
-
-    def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
-        """Learn the geometry from these views, where that is asked for."""
-        step = self.selection.step(Calibrate)
-        if step.geometry:
-            phases.enter("calibration", "steps")
-            self.learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
-
-    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views, before calibration."""
-        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
-        for found in self.moved.values():
-            geometry = found.corrected(geometry, view_ids)
-        for step in (step for step in in_order(self.selection) if isinstance(step, RayStep)):
-            geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
-        return geometry
-
-    def of(self, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views."""
-        geometry = self.uncalibrated(self.selection, view_ids)
-        return geometry if self.learnt is None else self.learnt.corrected(geometry, view_ids)
 
 
 def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 from beamline.projections.step import NamedStep, StepDone, StepMemory
 
@@ -85,7 +85,7 @@ class ViewStep(PrepStep, Protocol):
         """
 
 
-class ViewPlaces(Protocol):
+class ViewMotion(Protocol):
     """Where the sample was in the views of a scan.
 
     Attributes:
@@ -107,6 +107,22 @@ class ViewPlaces(Protocol):
         """The geometry of these rows of the file, as the sample was in them."""
 
 
+@dataclass(frozen=True, eq=False)
+class Unmoved:
+    """The motion of a sample that stood in all these views.
+
+    Attributes:
+        frames: int64 [view], rows of the file.
+    """
+
+    frames: NDArray[np.int64]
+    said: ClassVar[str] = ""
+    done: ClassVar[StepDone] = StepDone(parameters={})
+
+    def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
+        return geometry
+
+
 @runtime_checkable
 class PlaceStep(PrepStep, Protocol):
     """A step that finds where the sample was in each view, before views are corrected."""
@@ -118,7 +134,7 @@ class PlaceStep(PrepStep, Protocol):
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> ViewPlaces:
+    ) -> ViewMotion:
         """The views that are used, where the sample was in them, and what was done.
 
         Args:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.projections.step import NamedStep
-from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
+
+if TYPE_CHECKING:
+    from beamline.storage.readers.base import ScanSource
 
 S = TypeVar("S", bound=NamedStep)
 
@@ -129,6 +131,18 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )
+
+
+def pivot_of(source: ScanSource, selection: Selection) -> float:
+    """The middle row of the detector, binned and counted from the first row used."""
+    middle, binning = (source.shape[0] - 1) / 2, selection.binning
+    return (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
+
+
+def with_pivot(geometry: Geometry, pivot: float) -> Geometry:
+    """The geometry whose views roll and tilt about the row `pivot`."""
+    # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
+    return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)
 
 
 def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:

@@ -12,11 +12,10 @@ from beamline.core.errors import DataError
 from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
-from beamline.core.text import count
+from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.jumps import Jumps
-from beamline.projections.jumps import frames_text
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PlaceStep, RayStep, ScanStep

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import DataError
-from beamline.projections.background import without_background
+from beamline.projections.corrections.air import without_background
 from recon.base.geometry import Geometry
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom

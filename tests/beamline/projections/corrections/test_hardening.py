@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from beamline.projections.corrections.hardening import Hardening
-from beamline.projections.hardening import curve_of
+from beamline.projections.corrections.hardening import Hardening, curve_of
 from recon.base.geometry import Geometry
 from simulators.effects.beam_hardening import BeamHardening
 from simulators.frame.detector import Detector

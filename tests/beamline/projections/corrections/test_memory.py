@@ -17,13 +17,12 @@ from beamline.projections.corrections.flats import Flats
 from beamline.projections.corrections.hardening import Hardening
 from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.corrections.phase import Phase
-from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.corrections.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
-from beamline.projections.tilt import with_tilt
 from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
