@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ class Recording:
     """A scan file of ours, opened for reading while it may still be written.
 
     Args:
-        alone: it may draw on no file outside of its folder, since another user may have written it.
+        alone: it may be no link and draw on no file outside of its folder, since another user may have written it.
 
     Raises:
         NotReadyError: the file is just being made.
@@ -43,7 +43,8 @@ class Recording:
 
     def __init__(self, path: Path, alone: bool = False) -> None:
         self.path = path
-        self._file = hdf5.open_hdf5(path, follow=True)
+        with hdf5.opened_itself(path) if alone else nullcontext():
+            self._file = hdf5.open_hdf5(path, follow=True)
         try:
             if alone:
                 require_inside(self._file)

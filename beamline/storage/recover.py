@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
@@ -231,7 +231,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
                 f"{path} cannot be mended in place: its frames are copied to a new file of about {size(head.size)}; "
                 f"the damaged file is kept as {kept.name}."
             )
-            if kept.exists() and kept.samefile(path):
+            if kept.exists() and same_file(kept.stat(), path.stat()):
                 kept.unlink()  # a recovery died between its last two steps
             refuse_existing(kept)
             with whole_file(new, replace=True) as partial, hdf5.created(partial, layout.LIBVER) as made:
