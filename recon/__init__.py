@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import DataUse, Progress, RunControl
+from recon.base.method import DataUse, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.methods import REGISTRY
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
-    from recon.reconstruction import Reconstruction, reconstruct
+    from recon.reconstruction import reconstruct
     from recon.registration import register_energies
     from recon.series import TimedViews, TimedVolumes, fit_series
     from recon.share_fit import fit_share
@@ -118,7 +118,6 @@ _LAZY = {
     **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
-    "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.registration",
     **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),

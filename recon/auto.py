@@ -11,7 +11,7 @@ from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Method, MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.methods import with_settings
 from recon.splatting.finish import SWEEPS
@@ -65,7 +65,7 @@ class Auto:
         first, *others = self.candidates
         return self.candidates if self.longer_fit is None else (first, self.longer_fit, *others)
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
 
         Raises:

@@ -2,71 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
-from recon.base.picture import html, middle_slices
+from recon.base.method import DataUse, Method, ReconProblem, RunControl
+from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
-from recon.splatting.gaussians import Gaussians
 from recon.voxels.emission import Emission, weighted_lines
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """The result of `reconstruct`.
-
-    Attributes:
-        volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
-        seconds: wall time of the reconstruction.
-        history: the record of the fit or the iterations, empty for a direct method.
-        method: its name; of a choice (`recon.Auto`), that of the method chosen.
-        gaussians: the model behind the volume of a fit.
-        settings: every parameter that was used.
-        checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
-    """
-
-    volume: Volume
-    seconds: float
-    history: tuple[Progress, ...]
-    method: str
-    gaussians: Gaussians | None
-    settings: Mapping[str, Any]
-    checkpoint: Mapping[str, NDArray[Any]] | None = None
-
-    def __repr__(self) -> str:
-        model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
-        return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
-
-    def _repr_html_(self) -> str:
-        """For a notebook: the volume's middle slices, its method and its settings."""
-        pixels, (low, high) = middle_slices(self.volume.data)
-        facts = {"result": repr(self)[15:-1], "grey": f"black {low:.4g}, white {high:.4g}"}
-        if self.history and np.isfinite(self.history[-1].residual):
-            facts["residual"] = f"{self.history[-1].residual:.4g} after {self.history[-1].step} steps"
-        return html(f"Reconstruction by {self.method}", pixels, facts)
-
-    def save(self, path: str | Path) -> None:
-        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
-
-        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays.
-        """
-        settings = {k: v for k, v in self.settings.items() if not isinstance(v, np.ndarray)}
-        told = json.dumps(settings, default=str)
-        self.volume.save(path, method=self.method, seconds=self.seconds, settings=told)
 
 
 def reconstruct(
@@ -124,11 +75,9 @@ def reconstruct(
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     begin = control.now()
-    found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
-    return Reconstruction(
-        found.volume, control.now() - begin, found.history, found.method or chosen.name, found.gaussians,
-        MappingProxyType(dict(found.settings)), found.checkpoint,
-    )  # fmt: skip
+    result = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
+    settings = MappingProxyType(dict(result.settings))
+    return replace(result, settings=settings, method=result.method or chosen.name, seconds=control.now() - begin)
 
 
 def _warn_of_negative(data: NDArray[np.float32]) -> None:

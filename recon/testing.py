@@ -21,9 +21,9 @@ from recon.base.method import (
     CheckpointedMethod,
     DataUse,
     Method,
-    MethodResult,
     PresetMethod,
     ReconProblem,
+    Reconstruction,
     RunControl,
     Traits,
 )
@@ -110,6 +110,6 @@ class MethodConformance:
             resumed = self._resumed(method, whole.checkpoint)
             np.testing.assert_array_equal(resumed.volume.data, whole.volume.data)
 
-    def _resumed(self, method: Method, checkpoint: Mapping[str, NDArray[Any]] | None) -> MethodResult:
+    def _resumed(self, method: Method, checkpoint: Mapping[str, NDArray[Any]] | None) -> Reconstruction:
         assert checkpoint is not None
         return method.run(problem(), RunControl(resume=checkpoint))

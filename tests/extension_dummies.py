@@ -29,7 +29,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import MethodResult, Traits
+from recon.base.method import Reconstruction, Traits
 from recon.base.volume import Volume
 
 
@@ -42,7 +42,7 @@ class Grey:
     shade: float = 0.5
 
     def run(self, problem, control):
-        return MethodResult(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
+        return Reconstruction(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
 
     def toy(self):
         return self
@@ -63,11 +63,12 @@ import numpy as np
 import recon
 from click.testing import CliRunner
 from beamline.cli.method_options import takers
+from beamline.cli.options import Owner
 from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
 from beamline.reconstruct.outcome import label_of
-from beamline.tradeoff.figures import pareto_plot
-from beamline.tradeoff.trials import plan
+from beamline.trials.figures import pareto_plot
+from beamline.trials.trial import plan
 from recon import methods
 
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))
@@ -81,7 +82,7 @@ assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers("iterations") and "grey" not in takers("tv_weight")
+assert "grey" in takers(Owner("iterations")) and "grey" not in takers(Owner("tv_weight"))
 assert label_of("grey") == "Grey"
 """,
 )

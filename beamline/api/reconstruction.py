@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from beamline.api.instrument import Say, to_stderr
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event, VolumeDone, Warned
+from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
@@ -23,7 +22,6 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import SystemClock
 from recon.auto import Auto
@@ -32,45 +30,7 @@ from recon.base.method import Method
 from recon.base.volume import Volume
 from recon.methods import by_name
 
-
-@dataclass(frozen=True, eq=False)
-class ReconResult:
-    """A reconstruction of a scan file.
-
-    Attributes:
-        method: its name; of a choice, that of the method chosen.
-        figures: figures of merit by name (residual, seconds, ...), see docs/tradeoff.md.
-        settings: everything that the volume depends on, by name.
-        axis_col: rotation axis in columns of the full detector.
-        units: of the volume, 1/mm, or 1/px if the pixel size is unknown; of an emission counts/mm.
-        warnings: sentences.
-        ended_early: Ctrl-C ended it with the volume so far.
-        output, report: files; None if not requested.
-    """
-
-    method: str
-    figures: Mapping[str, float]
-    settings: Mapping[str, Any]
-    axis_col: float
-    units: str
-    warnings: tuple[str, ...]
-    ended_early: bool
-    output: Path | None
-    report: Path | None
-    _held: Volume | None = field(default=None, repr=False)
-
-    @cached_property
-    def volume(self) -> Volume:
-        """The attenuation, `volume.data` float32 [z, y, x]; read from `output`, if requested, on first use."""
-        if self._held is not None:
-            return self._held
-        assert self.output is not None
-        with opened_volume(self.output) as record:
-            return replace(record.volume, data=np.array(record.volume.data))
-
-    def _repr_html_(self) -> str:
-        figures = ", ".join(f"{name} {value:.4g}" for name, value in self.figures.items())
-        return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
+ReconResult = ReconRecord  # what scripts get
 
 
 def reconstruct(
@@ -105,23 +65,16 @@ def reconstruct(
         that exists or cannot be written. Nothing is written then.
     """
     place, chosen = scan_file(path), _method(method)
-    last: list[VolumeDone] = []
-    warned: list[str] = []
-    settings: dict[str, Any] = {}
+    made: list[ReconRecord] = []
     held: list[Volume] = []
 
     def sink(event: Event) -> None:
-        match event:
-            case VolumeDone():
-                last.append(event)
-                return
-            case Warned(message=message):
-                warned.append(message)
-        if say is not None and (text := sentence(event)):
+        if isinstance(event, VolumeDone):
+            made.append(event.record)
+        elif say is not None and (text := sentence(event)):
             say(text)
 
     def take(record: ReconRecord) -> None:
-        settings.update(record.parameters)
         if output is None:
             held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a temporary file
 
@@ -130,20 +83,9 @@ def reconstruct(
     with target_of(output, take) as target:
         command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
-        figures = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
-    (done,) = last
-    return ReconResult(
-        method=done.method,
-        figures=figures,
-        settings=settings,
-        axis_col=done.axis_col,
-        units=done.units,
-        warnings=tuple(warned),
-        ended_early=bool(done.ended_early),
-        output=None if output is None else Path(output),
-        report=target.report,
-        _held=held[0] if held else None,
-    )
+        reconstruct_file(options, sink, SystemClock(), StopOnSignal())
+    (record,) = made
+    return record if output is not None else replace(record, volume=held[0], output=None)
 
 
 def _method(method: str | Method) -> Method:

@@ -58,7 +58,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     if not as_json:
         done = last[-1]
         assert isinstance(done, VolumeDone)
-        click.echo(f"{'folder':<10}{done.output.parent}\n{results(done)}")
+        click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
 
 
 @contextmanager
@@ -129,7 +129,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
     from beamline.reconstruct.model import read_model
-    from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
+    from beamline.reconstruct.outcome import ReportContext, facts_of
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.reconstruct.parameters import axis_of
     from beamline.reconstruct.result import write_result
@@ -137,6 +137,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     from beamline.storage.readers.open import open_scan
     from beamline.storage.writers.recon_file import read_reconstruction
     from recon.assess.metrics import psnr
+    from recon.base.method import Reconstruction
     from recon.base.volume import Grid, Volume
 
     record = read_reconstruction(folder / RECON)
@@ -147,19 +148,19 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         prepared = replace(prepare_projections(source, selection, warnings.append), axis=axis_of(record.parameters))
     grid = Grid.matching(prepared.geometry)
     ideal = truth(grid)
-    made = ReconOutcome(
+    made = Reconstruction(
         volume=Volume(record.volume.data, grid),
         method=config.recon.method,
         seconds=record.metrics["seconds"],
         history=history_from(record.history),
         settings=record.parameters,
         gaussians=read_model(folder / RECON).gaussians if record.model else None,
-        psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes],
     )
     target = OutputPaths(folder / RECON, report_beside(folder / RECON), replace=True)
     live = target.live_picture.name if target.live_picture.exists() else ""
+    curve = [(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes]
     context = ReportContext(
-        facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live
+        facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live, psnr=curve
     )
     write_result(made, prepared, ideal, target, context, outside, clock)
 

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Self, TextIO
+from typing import TYPE_CHECKING, Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -36,6 +36,9 @@ from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock
 from drivers.manual import Ask
 from recon.methods import BASELINE
+
+if TYPE_CHECKING:
+    from beamline.storage.writers.recon_file import ReconRecord
 
 LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
 SAY_EVERY = 0.2  # s between events on the progress of many frames
@@ -212,43 +215,43 @@ def fit(at: FitReached) -> str:
 
 def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]:
     """A listener that reports the progress of a stage of the work, a few times a second."""
-    began, said = clock.now(), -math.inf
+    began, last_line_at = clock.now(), -math.inf
 
     def progress(n: int, total: int) -> None:
-        nonlocal said
+        nonlocal last_line_at
         now = clock.now()
-        if now - said < SAY_EVERY and n < total:
+        if now - last_line_at < SAY_EVERY and n < total:
             return
-        said = now
+        last_line_at = now
         rate = n / max(now - began, 1e-9)
         sink(Counted(stage, n, total, rate, (total - n) / rate, time=now))
 
     return progress
 
 
-def results(done: VolumeDone) -> str:
+def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
-    lines = [f"{'output':<10}{done.output}"]
-    lines += [f"{'report':<10}{done.report}"] if done.report else []
-    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in done.shape)} in {done.units}")
-    lines.append(f"{'axis_col':<10}{done.axis_col:.2f}")
-    lines += [f"{'chosen':<10}{done.chosen}"] if done.chosen else []
-    lines += [f"{'next dB':<10}{done.next_db_said}"] if done.next_db_said else []
-    columns = {done.method: {**done.metrics, "elapsed": done.elapsed}} | (
-        {} if done.fbp is None else {BASELINE: done.fbp}
-    )
+    lines = [f"{'output':<10}{record.output}"]
+    lines += [f"{'report':<10}{record.report}"] if record.report else []
+    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in record.grid.shape)} in {record.unit}")
+    lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
+    lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
+    lines += [f"{'next dB':<10}{record.next_decibel_text}"] if record.next_decibel_text else []
+    columns = {record.method: {**record.metrics, "elapsed": record.elapsed}}
+    if record.compared is not None:
+        columns[BASELINE] = {**record.compared}
     lines.append("")
     lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
             label = metric.label
-            if name == "seconds" and done.resumed_from:
+            if name == "seconds" and record.parameters.get("resumed_from"):
                 label += ", since resumed"
             lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
     return "\n".join(lines)
 
 
 def _clock_time(seconds: float) -> str:
-    left = round(seconds)
-    return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
+    whole_seconds = round(seconds)
+    return f"{whole_seconds // 3600}:{whole_seconds // 60 % 60:02}:{whole_seconds % 60:02}"

@@ -123,10 +123,10 @@ def tradeoff(
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
     from beamline.scan.energies import scans_of
-    from beamline.tradeoff.compared import Several
-    from beamline.tradeoff.opened import ComparedScan
-    from beamline.tradeoff.report import text
-    from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
+    from beamline.trials.compared import Several
+    from beamline.trials.opened import ComparedScan
+    from beamline.trials.report import text
+    from beamline.trials.tradeoff import TradeoffOptions, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
     if seconds is not None and (volumes is not None or spectra is not None):

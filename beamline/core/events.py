@@ -20,7 +20,8 @@ from beamline.core.process import json_object
 
 KINDS: dict[str, list[type[Event]]] = {}
 """The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
-_SPREAD = {"spread": True}  # of a field whose own values stand in the line, a mapping or a dataclass
+_SPREAD = {"spread": True}
+"""Of a field whose own values stand in the line: a mapping, a dataclass, or what says by `told` what it shows."""
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
@@ -54,7 +55,7 @@ class Event:
         for each in (*own, *(each for each in fields(Event) if each.name != "time")):
             value = getattr(self, each.name)
             if each.metadata == _SPREAD:
-                found |= _values_of(value) if is_dataclass(value) else value
+                found |= _spread(value)
             elif value is not each.default:
                 found[each.name] = value
         return found
@@ -145,6 +146,13 @@ def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
         if line.endswith(b"\n"):
             yield b"" if within else line
         within = not line.endswith(b"\n")
+
+
+def _spread(value: Any) -> Mapping[str, Any]:
+    """What a value says of itself in a line, by name; a plain dataclass says all."""
+    if hasattr(value, "told"):
+        return value.told()
+    return _values_of(value) if is_dataclass(value) else value
 
 
 def _values_of(value: Any) -> dict[str, Any]:
@@ -440,40 +448,6 @@ class Diagnosed(Listed, event="check"):
     """One result of `beamline doctor`."""
 
 
-class VolumeDone(Event, event="done"):
-    """A reconstruction has ended well.
-
-    Attributes:
-        output, report: files of the volume and of its report.
-        shape, units: of the volume [z, y, x].
-        elapsed, times: s in all, and of each phase.
-        metrics: of the volume, by name; `seconds` and the residuals are among them.
-        ended_early, resumed_from, checkpoint_lost: where that is so.
-        hiding: the warning of what the volume hides, where it does.
-        chosen: how `auto` came to its method. next_db, next_db_said: what one more decibel costs.
-        fbp: metrics of the FBP that it is compared with.
-    """
-
-    output: Path
-    report: Path | None
-    method: str
-    axis_col: float
-    n_views: int
-    shape: Sequence[int]
-    units: str
-    elapsed: float
-    times: Mapping[str, float]
-    metrics: Mapping[str, float] = field(metadata=_SPREAD)
-    ended_early: Any = None
-    resumed_from: str | None = None
-    checkpoint_lost: str | None = None
-    hiding: str | None = None
-    chosen: str | None = None
-    next_db: Any = None
-    next_db_said: str | None = None
-    fbp: Mapping[str, float] | None = None
-
-
 class RunDone(Event, event="done"):
     """A run has ended well. result: `scan.run.RunResult`."""
 
@@ -483,6 +457,15 @@ class RunDone(Event, event="done"):
 
 class Done(Listed, event="done"):
     """A command has ended well; the values are what it found or wrote."""
+
+
+class VolumeDone(Event, event="done"):
+    """A reconstruction of this process has ended well; that of another process is read as `Done`.
+
+    record: of the volume, a `beamline.storage.writers.recon_file.ReconRecord`.
+    """
+
+    record: Any = field(metadata=_SPREAD)
 
 
 class Failed(Event, event="failed"):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 from beamline.core.errors import DataError, QualityError
-from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, VolumeDone, Warned, event_of
+from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.storage.writer_lock import WriterLock, held
@@ -237,7 +237,7 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
             event = event_of(json_object(line) or {})
         except ValueError:
             return
-        if isinstance(event, VolumeDone | Done | Failed):
+        if isinstance(event, Done | Failed):
             last = event.data
         else:
             sink(replace(event, scan=row.scan))

@@ -18,11 +18,10 @@ from recon.assess.plans import Choice, Speeds, plans
 from recon.assess.time_model import duration_text
 from recon.auto import is_wider
 from recon.base.binning import bin_views
-from recon.base.method import DataUse, Method, ReconProblem, RunControl, TimedMethod
+from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
 from recon.machine_speed import measured_speeds
 from recon.methods import with_settings
-from recon.reconstruction import Reconstruction
 from recon.splatting.initialise import default_count
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method

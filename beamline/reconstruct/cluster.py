@@ -22,8 +22,7 @@ from beamline.core.process import SAFE_PATH
 from beamline.reconstruct.slurm import is_slurm, require_accepted, slurm_jobs, submitted
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Method, RunControl
-from recon.reconstruction import Reconstruction
+from recon.base.method import Method, Reconstruction, RunControl
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -27,7 +27,7 @@ from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, ma
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
 from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.remarks import partly_seen_warning
@@ -38,11 +38,19 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
-from recon.base.method import BoundedMethod, CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
+from recon.base.method import (
+    BoundedMethod,
+    CheckpointedMethod,
+    DataUse,
+    Method,
+    Progress,
+    Reconstruction,
+    RunControl,
+    candidates_of,
+)
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
-from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
 from recon.splatting.fit_method import FitMethod
 from recon.warm_up import warm_up
@@ -113,19 +121,19 @@ def reconstruct_file(
         with stopping() as stopped, warnings_told(warn):
             job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
             if options.budget is not None:
-                outcome, prepared, factor = _within_budget(job, options.budget)
+                made, chosen, prepared, factor = _within_budget(job, options.budget)
                 selection = replace(selection, binning=selection.binning * factor)
             else:
-                outcome = _by_slabs(job, slabs, decided) if slabs else _at_once(job, decided)
+                made, chosen = _by_slabs(job, slabs, decided) if slabs else _at_once(job, decided)
         if options.uncertainty:
             phases.enter("error bars")
             with stop_scope() as stopped, warnings_told(warn):
-                outcome = _with_error_bars(replace(job, stop_latch=StopLatch(stopped)), outcome, slabs, decided)
+                made = _with_error_bars(replace(job, stop_latch=StopLatch(stopped)), made, slabs, decided)
         if slabs and options.method.traits.direct and prepared.view_weights is not None:
             # For the record: FBP takes all rays alike, and so do its figures.
-            outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
+            made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
             prepared = replace(prepared, view_weights=None)
-        truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
+        truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
         context = ReportContext(
             facts,
             selection,
@@ -137,11 +145,13 @@ def reconstruct_file(
             region=region,
             phases=phases,
             leaves=deadline.leaves,
+            filter=options.filter,
+            chosen=chosen,
         )
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         with stopping():  # the volume is there: the first signal no longer discards it
-            metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)
-        del outcome  # Windows removes no file that is mapped
+            metrics = write_result(made, prepared, truth, options.target, context, sink, clock, partial_volume)
+        del made  # Windows removes no file that is mapped
     return metrics
 
 
@@ -266,22 +276,15 @@ class _Job:
                 use=DataUse(weights, held_out, prepared.emission), control=control,
             )  # fmt: skip
 
-    def outcome(self, result: Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:
-        """The result with its own settings, `settings`, and whether it ended early."""
-        return ReconOutcome(
-            volume=result.volume,
-            method=result.method,
-            seconds=result.seconds,
-            history=result.history,
-            settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
-            filter=self.options.filter,
-            chosen=chosen,
-            gaussians=result.gaussians,
-        )
+
+def _recorded(result: Reconstruction, early: bool, settings: Mapping[str, Any] | None = None) -> Reconstruction:
+    """The result with `settings`, and whether it ended early, for the record; without what only a next run needs."""
+    ended = {"ended_early": True} if early else {}
+    return replace(result, settings={**result.settings, **(settings or {}), **ended}, checkpoint=None)
 
 
-def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decided: Decisions) -> ReconOutcome:
-    """The outcome with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
+def _with_error_bars(job: _Job, made: Reconstruction, slabs: Sequence[Slab], decided: Decisions) -> Reconstruction:
+    """The volume with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
     if "ended_early" in made.settings:
         job.warn("The error bars were left out, as the reconstruction was stopped.")
         return made
@@ -307,8 +310,8 @@ def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decid
     return replace(made, deviation=found, settings={**made.settings, **settings})
 
 
-def _at_once(job: _Job, decided: Decisions) -> ReconOutcome:
-    """Run a method on the whole volume; save checkpoints and continue from one if asked to."""
+def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
+    """Run a method on the whole volume; save checkpoints and continue from one if asked to. Then what was chosen."""
     options, prepared, checkpoints = job.options, job.prepared, job.options.checkpoints
     method = options.method_for(prepared.geometry)
     origin, resume, steps = {}, None, 0
@@ -345,11 +348,11 @@ def _at_once(job: _Job, decided: Decisions) -> ReconOutcome:
     finishes = isinstance(method, FitMethod) and method.finish_sweeps > 0
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
     said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))
+    return _recorded(result, early, said | ({"checkpoint_lost": lost} if lost else {})), chosen
 
 
-def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> ReconOutcome:
-    """Run a method slab by slab."""
+def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> tuple[Reconstruction, str]:
+    """Run a method slab by slab. Then what was chosen."""
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now, decide=decided)
 
@@ -358,7 +361,7 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> ReconOutc
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
         result = in_slabs(job.run_on, job.prepared, options, slabs, control, job.say, job.warn, workers)
-    return job.outcome(result, job.stop_latch.stopped, _chosen(result))
+    return _recorded(result, job.stop_latch.stopped), _chosen(result)
 
 
 def _chosen(result: Reconstruction) -> str:
@@ -367,11 +370,11 @@ def _chosen(result: Reconstruction) -> str:
     return "" if because is None else f"{result.method}: {because}"
 
 
-def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
-    """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the binning of their pixels."""
+def _within_budget(job: _Job, budget: float) -> tuple[Reconstruction, str, PreparedProjections, int]:
+    """Reconstruct within `budget` s. Then what was chosen, the views used, and the binning of their pixels."""
     methods, largest = candidates_of(job.options.method), None if job.region is None else 1
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
         done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
-    outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
-    return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning
+    made = _recorded(replace(done.result, seconds=done.seconds), job.stop_latch.stopped, done.settings(budget))
+    return made, done.summary(budget), done.prepared, done.choice.binning

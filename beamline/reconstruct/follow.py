@@ -95,7 +95,7 @@ def follow(
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = ReportContext(
         facts, options.selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
-        live_picture=options.target.live_picture.name if growing.snapshots.drawn else "",
+        live_picture=options.target.live_picture.name if growing.snapshots.drawn else "", filter=options.filter,
     )  # fmt: skip
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshots.remove()

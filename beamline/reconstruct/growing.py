@@ -27,14 +27,13 @@ from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ReconOutcome
 from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Progress, ReconProblem, RunControl
+from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
@@ -287,7 +286,7 @@ class ScanFollower:
 
     def finish(
         self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
-    ) -> tuple[ReconOutcome, PreparedProjections]:
+    ) -> tuple[Reconstruction, PreparedProjections]:
         """The last round over all views in `seconds` or until `stopped`, with snapshots.
 
         Returns the volume, and the line integrals that it grew from, to judge it by.
@@ -340,8 +339,8 @@ class ScanFollower:
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
         method, seconds = self._options.method.name, self._clock.now() - self._begin
-        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter, gaussians=gaussians)
-        return made, prepared
+        history = tuple(self._history)
+        return Reconstruction(volume, settings, history, gaussians, method=method, seconds=seconds), prepared
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext
+from beamline.reconstruct.outcome import ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
     hiding_warning,
@@ -24,6 +23,7 @@ from beamline.reconstruct.remarks import (
 from beamline.storage.scratch import scratch_array
 from drivers.base.clock import Clock
 from recon.assess.lost_mass import compare
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
@@ -34,31 +34,8 @@ from recon.voxels.unexplained import Unexplained, unexplained
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedVolume:
-    """A volume with what was found about it.
-
-    Attributes:
-        volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
-        metrics: figures of merit of each, by method.
-        remarks: warnings, those of the context first.
-        left: what the volume leaves in the views; None where that is not known.
-        stray: mass where views show nothing [y, x]; None without any.
-        hiding: the warning that the volume may hide structure; empty without one.
-        keeps_fbp: FBP is to be kept in the output, because the volume is in doubt.
-    """
-
-    volumes: Mapping[str, Volume]
-    metrics: Mapping[str, dict[str, float]]
-    remarks: Sequence[str]
-    left: Unexplained | None
-    stray: NDArray[np.float32] | None
-    hiding: str
-    keeps_fbp: bool
-
-
 def judge(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -66,7 +43,7 @@ def judge(
     sink: Sink,
     clock: Clock,
     in_parts: bool = False,
-) -> JudgedVolume:
+) -> Judgement:
     """Measure a volume, compare it with its views and with FBP, and tell `sink` of each warning.
 
     Looks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
@@ -74,36 +51,37 @@ def judge(
     Args:
         in_parts: the output is made of slabs already, so that FBP cannot be kept in it.
     """
-    at_work = _Judging(made, prepared, truth, target, context, sink, clock)
-    at_work.remarks.extend(context.warnings)
-    left = at_work.look_at_residual()
-    stray = at_work.look_for_stray_mass()
-    at_work.warn(needles_warning(made, prepared.geometry))
-    at_work.look_for_odd_views()
-    compared = at_work.compare_with_fbp()
-    at_work.compare_regions()
-    at_work.compare_air()
-    hiding = "" if left is None else hiding_warning(made, left)
-    doubtful = at_work.look_for_lost_mass() or bool(hiding)
-    keeps_fbp = doubtful and compared and not in_parts and target.takes_a_second(made.volume.grid)
-    if keeps_fbp:
-        at_work.warn(
-            f"FBP of the same views is kept beside the volume: `beamline view {target.output.name}` shows both."
-        )
-    elif doubtful and compared:
-        at_work.warn(
-            "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
-            "disk. Make it with --method fbp to compare."
-        )
-    at_work.tell_what_was_left_out()
-    return JudgedVolume(at_work.volumes, at_work.metrics, at_work.remarks, left, stray, hiding, keeps_fbp)
+    judged = Judgement(made, prepared, truth, target, context, sink, clock)
+    judged.warnings.extend(context.warnings)
+    judged.look_at_residual()
+    judged.look_for_stray_mass()
+    judged.warn(needles_warning(made, prepared.geometry))
+    judged.look_for_odd_views()
+    judged.compare_with_fbp()
+    judged.compare_regions()
+    judged.compare_air()
+    judged.decide_whether_fbp_is_kept(in_parts)
+    judged.tell_what_was_left_out()
+    return judged
 
 
 @dataclass(eq=False)
-class _Judging:
-    """The looks at one volume, in their order, with what they found so far."""
+class Judgement:
+    """The looks at one volume, in their order, and what they showed.
 
-    made: ReconOutcome
+    Attributes:
+        volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
+        metrics: figures of merit of each, by method.
+        warnings: those of the context first.
+        left_out: looks for which there was no time.
+        unexplained: what the volume leaves in the views; None where that is not known.
+        stray: mass where views show nothing; None where it was not looked for.
+        hiding: the warning that the volume may hide structure; empty without one.
+        keeps_fbp: FBP is to be kept in the output, because the volume is in doubt.
+        all_rays: seconds to project all views, about.
+    """
+
+    made: Reconstruction
     prepared: PreparedProjections
     truth: Volume | None
     target: OutputPaths
@@ -112,10 +90,13 @@ class _Judging:
     clock: Clock
     volumes: dict[str, Volume] = field(init=False)
     metrics: dict[str, dict[str, float]] = field(default_factory=dict)
-    remarks: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    unexplained: Unexplained | None = None
     stray: StrayMass | None = None
-    all_rays: float = 0.0  # seconds to project all views, about
+    hiding: str = ""
+    keeps_fbp: bool = False
+    all_rays: float = 0.0
 
     def __post_init__(self) -> None:
         self.volumes = {self.made.method: self.made.volume}
@@ -137,7 +118,20 @@ class _Judging:
         """Tell of a warning that is not empty, and keep it."""
         if said:
             self.sink(Warned(said, time=self.clock.now()))
-            self.remarks.append(said)
+            self.warnings.append(said)
+
+    @property
+    def stray_map(self) -> NDArray[np.float32] | None:
+        """The map of mass where views show nothing [y, x]; None without any."""
+        return self.stray.map if self.stray is not None and self.stray.share > 0 else None
+
+    @property
+    def left_out_text(self) -> str:
+        """The looks left out, and why; empty without any."""
+        if not self.left_out:
+            return ""
+        why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"
+        return f"Left out, as {why}: {', '.join(self.left_out)}."
 
     def measured(self, volume: Volume, seconds: float) -> dict[str, float]:
         """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
@@ -146,40 +140,35 @@ class _Judging:
         found = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
         return {**found, "seconds": seconds}
 
-    def look_at_residual(self) -> Unexplained | None:
+    def look_at_residual(self) -> None:
         """Measure the volume, and what it leaves in the views: of a volume that was fitted to them.
 
         A direct method leaves the blur of its filter in them, which tells nothing of what it hides.
         """
         made, prepared, seed = self.made, self.prepared, self.context.seed
         views, rng = prepared.projections.data, np.random.default_rng(seed)
-        left = None
         if not self.direct:
-            left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
+            self.unexplained = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
         before = self.clock.now()
         own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
         self.all_rays = (self.clock.now() - before) / share
         if not self.direct and "residual" in own:
             self.warn(not_begun_warning(made, own["residual"], uniform_residual(made.volume.grid, prepared)))
-        if left is not None:
-            own["unexplained"] = left.share
-            self.warn(hiding_warning(made, left))
-        return left
+        if self.unexplained is not None:
+            own["unexplained"] = self.unexplained.share
+            self.hiding = hiding_warning(made, self.unexplained)
+            self.warn(self.hiding)
 
-    def look_for_stray_mass(self) -> NDArray[np.float32] | None:
-        """The map of mass where views show nothing; None without any."""
+    def look_for_stray_mass(self) -> None:
         made, prepared = self.made, self.prepared
         if not self.has_time_for(stray_mass_share(prepared.geometry, made.volume.grid)):
             self.left_out.append("the look for mass where views show nothing")
-            return None
-        stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
-        if stray is None:
-            return None
-        self.stray = stray
-        self.metrics[made.method]["stray"] = stray.share
-        self.warn(stray_mass_warning(made, stray))
-        return stray.map if stray.share > 0 else None
+            return
+        self.stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
+        if self.stray is not None:
+            self.metrics[made.method]["stray"] = self.stray.share
+            self.warn(stray_mass_warning(made, self.stray))
 
     def look_for_odd_views(self) -> None:
         if self.direct or self.has_time_for(_ODD_VIEWS):
@@ -187,23 +176,22 @@ class _Judging:
         else:
             self.left_out.append("the look for views that do not fit the volume")
 
-    def compare_with_fbp(self) -> bool:
-        """Put FBP of the same views first among the volumes; False where it is not wanted or takes too long."""
+    def compare_with_fbp(self) -> None:
+        """Put FBP of the same views first among the volumes, where it is wanted and does not take too long."""
         made, prepared, phases = self.made, self.prepared, self.context.phases
         if self.direct or self.target.report is None or not has_direct_method(prepared.geometry):
-            return False
+            return
         if not self.has_time_for(_DIRECT):
             self.left_out.append("FBP for comparison")
-            return False
+            return
         phases.enter("FBP for comparison", "slices")
         before = self.clock.now()
         grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
         out = scratch_array(self.target.output.parent, grid.shape) if on_disk else None
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.progress, out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, self.context.filter, phases.progress, out)
         fbp = Volume(data, grid)
         self.volumes = {BASELINE: fbp, **self.volumes}
         self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}
-        return True
 
     def compare_regions(self) -> None:
         """SNR and CNR of all volumes by the regions of one: the truth, else FBP of the views, else none of them.
@@ -241,12 +229,24 @@ class _Judging:
             lost = lost or bool(said)
         return lost
 
+    def decide_whether_fbp_is_kept(self, in_parts: bool) -> None:
+        """Whether the volume is in doubt, so that FBP is kept beside it where that is possible."""
+        doubtful = self.look_for_lost_mass() or bool(self.hiding)
+        if not doubtful or len(self.volumes) == 1:
+            return
+        self.keeps_fbp = not in_parts and self.target.takes_a_second(self.made.volume.grid)
+        if self.keeps_fbp:
+            output = self.target.output.name
+            self.warn(f"FBP of the same views is kept beside the volume: `beamline view {output}` shows both.")
+            return
+        self.warn(
+            "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
+            "disk. Make it with --method fbp to compare."
+        )
+
     def tell_what_was_left_out(self) -> None:
-        if self.left_out:
-            why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"
-            remark = f"Left out, as {why}: {', '.join(self.left_out)}."
-            self.sink(StateEntered("left_out", remark, time=self.clock.now()))
-            self.remarks.append(remark)
+        if self.left_out_text:
+            self.sink(StateEntered("left_out", self.left_out_text, time=self.clock.now()))
 
 
 def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_] | None:

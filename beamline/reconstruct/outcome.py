@@ -1,12 +1,10 @@
-"""The outcome of a reconstruction, and the facts of its scan and run that a report and a file state."""
+"""The facts of a scan, and the context of its reconstruction, that a report and a file state."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +16,11 @@ from beamline.projections.returned import returned_views
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.report.contact_sheet import FlaggedFrame
-from beamline.report.record import history_arrays, residual_curve
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.validate import scan_ended
 from drivers.base.frame import FrameKind
-from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
-from recon.base.method import Progress
-from recon.base.volume import Volume
 from recon.methods import by_name
-from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
 
 
@@ -60,77 +52,18 @@ class ScanFacts:
     ended: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class ReconOutcome:
-    """A reconstruction and how it was made.
-
-    Attributes:
-        seconds: of reconstruction alone.
-        history: of the fit or the iterations; empty for FBP.
-        filter: of the FBP (also of the one it is compared with).
-        psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
-        chosen: what a budget or a preset chose, in a line; empty where the settings were given.
-        gaussians: the model behind the volume, before its finish on voxels; None where there is none.
-        deviation: the standard deviation of each voxel; None where it was not asked for, or not finished.
-    """
-
-    volume: Volume
-    method: str
-    seconds: float
-    history: Sequence[Progress]
-    settings: Mapping[str, Any]
-    filter: Filter = "hann"
-    psnr: Sequence[tuple[float, float]] = ()
-    chosen: str = ""
-    gaussians: Gaussians | None = None
-    deviation: Volume | None = None
-
-    @property
-    def grew(self) -> bool:
-        """The number of views grew during the fit."""
-        return len({progress.n_views for progress in self.history}) > 1
-
-    @property
-    def next_decibel(self) -> NextDecibel | None:
-        """The price of another dB: for a fit by fits of other lengths, for iterations by their own record.
-
-        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
-        also for other rates than those of the fits that were measured, as after following a scan.
-        """
-        judged = residual_curve(history_arrays(self.history))
-        if judged is None or self.grew or "resumed_from" in self.settings:
-            return None
-        if "pace" in self.settings:  # of a fit
-            usual = FitSettings()
-            if self.settings["pace"] != usual.pace or self.settings.get("decay", usual.decay) != usual.decay:
-                return None
-            return next_decibel_of_fit(self.history[-1].seconds, self.history[-1].step)
-        return next_decibel(judged.seconds, judged.residuals)
-
-    @property
-    def next_decibel_text(self) -> str:
-        """The time of the next dB as text; empty if it is not known."""
-        found, judged = self.next_decibel, residual_curve(history_arrays(self.history))
-        if found is None or judged is None:
-            return ""
-        by_others = found.of == "volume"
-        if not found.measurable:
-            of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
-            return f"none {'in' if by_others else 'measurable in'} {of_what}"
-        high = f"to {duration_text(found.high)}" if math.isfinite(found.high) else "or far more"
-        span = f"{duration_text(found.low)} {high}"
-        source = "as longer fits gained on four other scans"
-        if not by_others:
-            source = f"from the residual of {judged.views} as it fell"
-        return f"about {duration_text(found.seconds)} more ({span}), {source}"
-
-
 @dataclass(frozen=True)
 class ReportContext:
     """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
 
-    `stray` is the map of mass where views show nothing [y, x], None without any. `elapsed` are the seconds of the whole
-    command until its report is drawn, 0 before.
+    Attributes:
+        filter: of FBP, also of the one that the volume is compared with.
+        chosen: what a budget, a preset or the data chose, in a line; empty where the settings were given.
+        psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
+        live_picture: file name of the last picture of a volume that grew with its scan.
+        leaves: whether there is time for so many seconds before the report.
+        stray: the map of mass where views show nothing [y, x]; None without any.
+        elapsed: seconds of the whole command until its report is drawn, 0 before.
     """
 
     facts: ScanFacts
@@ -142,11 +75,14 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
     region: RegionOfRows | None = None
-    live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
+    live_picture: str = ""
     phases: Phases = field(default_factory=Phases)
-    leaves: Callable[[float], bool] = lambda seconds: True  # whether there is time for so much before the report
+    leaves: Callable[[float], bool] = lambda seconds: True
     stray: NDArray[np.float32] | None = None
     elapsed: float = 0.0
+    filter: Filter = "hann"
+    chosen: str = ""
+    psnr: Sequence[tuple[float, float]] = ()
 
 
 def label_of(method: str) -> str:

@@ -10,13 +10,14 @@ import numpy as np
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext
+from beamline.reconstruct.outcome import ReportContext
 from beamline.reconstruct.remarks import partly_seen
 from beamline.storage.writers.recon_file import Value
+from recon.base.method import Reconstruction
 from recon.prep.align import AxisEstimate
 
 
-def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
+def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
     """All parameters of the volume, by name."""
     selection, geometry = context.selection, prepared.geometry
     rows = selection.rows
@@ -48,7 +49,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),
-        "filter": made.filter,
+        "filter": context.filter,
         "seed": context.seed,
         **_flat("", made.settings),
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, ScanFacts, as_text, label_of
+from beamline.reconstruct.outcome import ReportContext, ScanFacts, as_text, label_of
 from beamline.report import figures
 from beamline.report.contact_sheet import contact_sheet, reference_sheet
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
-from beamline.report.record import history_arrays, residual_curve
+from beamline.report.record import history_arrays, price_of_decibel, price_text, residual_curve, views_grew
 from beamline.report.time_curves import quality_against_time
 from beamline.storage.writers.recon_file import Value
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
 from recon.voxels.unexplained import LIMIT, Unexplained
@@ -26,7 +27,7 @@ _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be look
 
 
 def compose(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
@@ -51,7 +52,7 @@ def compose(
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
-            *_pictures(made, prepared, truth, volumes, left),
+            *_pictures(made, prepared, truth, volumes, left, context.psnr),
             *_stray_mass(context.stray, made.volume.grid, prepared),
             *_frame_pictures(context.facts),
         ],
@@ -63,7 +64,7 @@ def compose(
 
 
 def _summary(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     metrics: Mapping[str, Mapping[str, float]],
@@ -82,15 +83,15 @@ def _summary(
         summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
     if context.region is not None:
         summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
-    if made.chosen:
-        summary += f". Chosen: {made.chosen}"
-    if made.next_decibel_text:
-        summary += f". The next dB: {made.next_decibel_text}"
+    if context.chosen:
+        summary += f". Chosen: {context.chosen}"
+    if price := price_text(made):
+        summary += f". The next dB: {price}"
     return summary + "."
 
 
 def _footnotes(
-    made: ReconOutcome, truth: Volume | None, metrics: Mapping[str, Mapping[str, float]], left: Unexplained | None
+    made: Reconstruction, truth: Volume | None, metrics: Mapping[str, Mapping[str, float]], left: Unexplained | None
 ) -> list[str]:
     """What the figures of merit mean, as far as there are any."""
     footnotes = [
@@ -109,7 +110,7 @@ def _footnotes(
             "Level of air: the mean of the voxels that views show to be empty, within the field of all views, over the "
             "deviation of FBP there. Air of FBP that is below zero is missing from the other volume's weak matter."
         )
-    if made.grew:
+    if views_grew(made):
         footnotes.append(
             "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
             "the scan."
@@ -165,11 +166,12 @@ def _frame_pictures(facts: ScanFacts) -> list[Picture]:
 
 
 def _pictures(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
     left: Unexplained | None,
+    psnr: Sequence[tuple[float, float]],
 ) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
     kind, row = prepared.kind, geometry.detector_shape[0] // 2
@@ -229,8 +231,8 @@ def _pictures(
         pictures.append(
             Picture(
                 "Quality against time",
-                _history_caption(made),
-                quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
+                _history_caption(made, psnr),
+                quality_against_time(history_arrays(made.history), psnr, price_of_decibel(made)),
             )
         )
     pictures += [
@@ -281,13 +283,13 @@ def _of_wedges(unseen: Sequence[Wedge]) -> str:
     )
 
 
-def _history_caption(made: ReconOutcome) -> str:
+def _history_caption(made: Reconstruction, psnr: Sequence[tuple[float, float]]) -> str:
     gaussians = {progress.n_gaussians for progress in made.history}
-    growing = ["views"] * made.grew + ["Gaussians"] * (len(gaussians) > 1)
+    growing = ["views"] * views_grew(made) + ["Gaussians"] * (len(gaussians) > 1)
     parts = ["Misfit to the views in use"]
     if (judged := residual_curve(history_arrays(made.history))) is not None:
         parts.append(f"the residual of {judged.views} as dB below the data")
-    parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
+    parts += ["PSNR of its snapshots against the truth"] if psnr else []
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
-    since = "the file was found" if made.grew else "the start"
+    since = "the file was found" if views_grew(made) else "the start"
     return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from beamline.core.text import count, spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.outcome import ReconOutcome, label_of
+from beamline.reconstruct.outcome import label_of
 from recon.assess.lost_mass import Comparison
 from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting import needles
@@ -40,7 +41,7 @@ def partly_seen_warning(geometry: Geometry) -> str:
     )
 
 
-def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
+def lost_mass_warning(made: Reconstruction, beside_fbp: Comparison) -> str:
     """The warning that a volume has lost weak matter that FBP shows; empty if it has not."""
     if beside_fbp.lost is None:
         return ""
@@ -52,7 +53,7 @@ def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
     )
 
 
-def not_begun_warning(made: ReconOutcome, left: float, uniform: float) -> str:
+def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
     """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a cylinder.
 
     Args:
@@ -69,7 +70,7 @@ def not_begun_warning(made: ReconOutcome, left: float, uniform: float) -> str:
     )
 
 
-def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
+def hiding_warning(made: Reconstruction, left: unexplained.Unexplained) -> str:
     """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
     if left.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
         return ""
@@ -92,7 +93,7 @@ def _crossing_said(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int6
     )
 
 
-def stray_mass_warning(made: ReconOutcome, found: stray_mass.StrayMass) -> str:
+def stray_mass_warning(made: Reconstruction, found: stray_mass.StrayMass) -> str:
     """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
     if found.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
         return ""
@@ -102,7 +103,7 @@ def stray_mass_warning(made: ReconOutcome, found: stray_mass.StrayMass) -> str:
     )
 
 
-def needles_warning(made: ReconOutcome, geometry: Geometry) -> str:
+def needles_warning(made: Reconstruction, geometry: Geometry) -> str:
     """The warning that a model is made of needles; empty if it is not, or if there is no model."""
     if made.gaussians is None or not made.gaussians.n:
         return ""
@@ -116,7 +117,7 @@ def needles_warning(made: ReconOutcome, geometry: Geometry) -> str:
 
 
 def odd_views_warning(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     selection: Selection,
     progress: Callable[[int, int], None] = lambda done, of: None,

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.judge import judge
+from beamline.reconstruct.judge import Judgement, judge
 from beamline.reconstruct.model import arrays_of_model
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, label_of
+from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.recon_report import compose
 from beamline.report.html import write_report
-from beamline.report.record import history_arrays
-from beamline.storage.volumes.files import write_volume
+from beamline.report.record import history_arrays, price_of_decibel, price_text
+from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.writers.recon_file import ReconRecord, VolumeInFile
 from drivers.base.clock import Clock
+from recon.base.method import Reconstruction
 from recon.base.volume import Volume
 from recon.methods import BASELINE
 
-_ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an outcome that its event tells
-
 
 def write_result(
-    made: ReconOutcome,
+    made: Reconstruction,
     prepared: PreparedProjections,
     truth: Volume | None,
     target: OutputPaths,
@@ -49,35 +49,15 @@ def write_result(
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
     elapsed = clock.now() - context.started
-    context = replace(context, warnings=judged.remarks, stray=judged.stray, elapsed=elapsed)
-    own = judged.metrics[made.method]
+    remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
+    context = replace(context, warnings=remarks, stray=judged.stray_map, elapsed=elapsed)
     phases.enter("report")
-    parameters = parameters_of(made, prepared, context)
-    volumes, deviation = judged.volumes, made.deviation
-    if (region := context.region) is not None:
-        volumes = {method: region.cut(volume) for method, volume in volumes.items()}
-        deviation = None if deviation is None else region.cut(deviation)
-    volumes = {method: prepared.stretched(volume) for method, volume in volumes.items()}
-    deviation = None if deviation is None else prepared.stretched(deviation)
-    record = ReconRecord(
-        volume=volumes[made.method],
-        length_unit=prepared.length_unit,
-        kind=prepared.kind,
-        raw_file=str(context.facts.path.resolve()),
-        title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
-        sample=context.facts.sample or "not stated",
-        time=clock.now(),
-        parameters=parameters,
-        metrics=own,
-        history=history_arrays(made.history),
-        model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
-        deviation=None if deviation is None else deviation.data,
-        fbp=volumes[BASELINE].data if judged.keeps_fbp else None,
-    )
+    record, volumes = _record(judged, context, clock.now())
     page: Path | None = None
     try:
         if target.report is not None:
-            report = compose(made, prepared, truth, volumes, judged.metrics, parameters, context, judged.left)
+            metrics, parameters = judged.metrics, record.parameters
+            report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
             page = target.report
@@ -92,26 +72,52 @@ def write_result(
             remove(page)
         raise
     phases.end()
-    said: dict[str, Any] = {name: made.settings[name] for name in _ENDS if name in made.settings}
-    sink(
-        VolumeDone(
-            output=target.output,
-            report=target.report,
-            method=made.method,
-            axis_col=prepared.axis_col,
-            n_views=prepared.geometry.n_views,
-            shape=record.volume.grid.shape,
-            units=record.unit,
-            elapsed=clock.now() - context.started,
-            times=phases.seconds,
-            metrics=own,
-            **said,
-            hiding=judged.hiding or None,
-            chosen=made.chosen or None,
-            next_db=made.next_decibel,
-            next_db_said=None if made.next_decibel is None else made.next_decibel_text,
-            fbp=judged.metrics[BASELINE] if len(judged.metrics) > 1 else None,
-            time=clock.now(),
-        )
+    elapsed = clock.now() - context.started
+    volume = _left_in_file(record, target)
+    record = replace(record, volume=volume, deviation=None, fbp=None, model={}, elapsed=elapsed, times=phases.seconds)
+    sink(VolumeDone(record, time=clock.now()))
+    return dict(record.metrics)
+
+
+def _record(judged: Judgement, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
+    """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
+    made, prepared, target = judged.made, judged.prepared, judged.target
+
+    def written(volume: Volume) -> Volume:
+        return prepared.stretched(volume if context.region is None else context.region.cut(volume))
+
+    volumes = {method: written(volume) for method, volume in judged.volumes.items()}
+    record = ReconRecord(
+        volume=volumes[made.method],
+        length_unit=prepared.length_unit,
+        kind=prepared.kind,
+        raw_file=str(context.facts.path.resolve()),
+        title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
+        sample=context.facts.sample or "not stated",
+        time=now,
+        parameters=parameters_of(made, prepared, context),
+        metrics=judged.metrics[made.method],
+        history=history_arrays(made.history),
+        model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
+        deviation=None if made.deviation is None else written(made.deviation).data,
+        fbp=volumes[BASELINE].data if judged.keeps_fbp else None,
+        compared=judged.metrics.get(BASELINE) if len(judged.metrics) > 1 else None,
+        warnings=tuple(judged.warnings),
+        hiding=judged.hiding,
+        chosen=context.chosen,
+        next_decibel=price_of_decibel(made),
+        next_decibel_text=price_text(made),
+        output=target.output,
+        report=target.report,
     )
-    return own
+    return record, volumes
+
+
+def _left_in_file(record: ReconRecord, target: OutputPaths) -> VolumeInFile:
+    """The volume as it stays: whoever keeps the record holds no voxels, and no file open, until they are asked for."""
+
+    def read() -> Volume:
+        with opened_volume(target.output) as stored:
+            return replace(stored.volume, data=np.array(stored.volume.data[:]))
+
+    return VolumeInFile(record.grid, read)

@@ -24,10 +24,9 @@ from beamline.reconstruct.slabs import for_part
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from recon.base.decisions import Decisions
-from recon.base.method import Method, Progress, RunControl
+from recon.base.method import Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of
 from recon.base.volume import Grid, Volume
-from recon.reconstruction import Reconstruction
 from recon.voxels.methods.fista_tv import FistaTv
 
 _LOOKED_AT = 8  # views by which the rows with most matter are found
@@ -220,7 +219,7 @@ def _whole(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: f
     if options.partial is not None:
         settings["resumed_from"] = str(options.partial)
     history = tuple(Progress(*values) for values in kept["history"])
-    return Reconstruction(Volume(partial.volume, grid), seconds, history, kept["method"], None, settings)
+    return Reconstruction(Volume(partial.volume, grid), settings, history, method=kept["method"], seconds=seconds)
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:

@@ -19,7 +19,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.finished import require_finished
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.progress import sweeps_told
 from beamline.reconstruct.series_report import FACTORS, series_page
@@ -31,6 +31,7 @@ from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.run_time import RunTime
 from recon.series import TimedViews, fit_series
@@ -216,10 +217,12 @@ def reconstruct_series(
     shape, settings = series.data.shape, {"volumes": wanted.volumes, "moves": made.motion is not None, "chosen": chosen}
     if made.smooth is not None:
         settings["smooth"] = made.smooth
-    outcome = ReconOutcome(
-        Volume(series.data[0], made.grid), "series", fit_seconds, (),
-        settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}), options.filter,
-    )  # fmt: skip
+    first = Reconstruction(
+        Volume(series.data[0], made.grid),
+        settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}),
+        method="series",
+        seconds=fit_seconds,
+    )
     context = ReportContext(
         facts,
         options.selection,
@@ -229,16 +232,17 @@ def reconstruct_series(
         began,
         recipe=options.recipe,
         elapsed=clock.now() - began,
+        filter=options.filter,
     )
     record = ReconRecord(
-        volume=prepared.stretched(outcome.volume),
+        volume=prepared.stretched(first.volume),
         length_unit=prepared.length_unit,
         raw_file=str(facts.path.resolve()),
         title=f"{wanted.volumes} volumes in time of {facts.name}",
         sample=facts.sample or "not stated",
         time=clock.now(),
-        parameters=parameters_of(outcome, prepared, context),
-        metrics={"seconds": outcome.seconds, "residual": made.residual},
+        parameters=parameters_of(first, prepared, context),
+        metrics={"seconds": first.seconds, "residual": made.residual},
         series=series,
     )
     options.target.take(record)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -9,7 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.method import Progress
+from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
+from recon.base.method import Progress, Reconstruction
+from recon.splatting.settings import FitSettings
 
 _FIELDS = {f.name: f.type for f in fields(Progress) if f.name not in ("unit", "least_steps")}  # figures
 _WORDS = {"held_out": "views held out", "residual": "views used"}
@@ -62,3 +65,42 @@ def residual_curve(arrays: Mapping[str, NDArray[np.floating]]) -> ResidualCurve 
     if name == "held_out":  # measured now and then; the history repeats the last value in between
         measured &= np.concatenate(([True], np.diff(residuals) != 0))
     return ResidualCurve(_WORDS[name], seconds[measured], residuals[measured])
+
+
+def views_grew(made: Reconstruction) -> bool:
+    """Whether the number of views grew during the fit."""
+    return len({progress.n_views for progress in made.history}) > 1
+
+
+def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
+    """The price of another dB: for a fit by fits of other lengths, for iterations by their own record.
+
+    None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
+    also for other rates than those of the fits that were measured, as after following a scan.
+    """
+    judged, settings = residual_curve(history_arrays(made.history)), made.settings
+    if judged is None or views_grew(made) or "resumed_from" in settings:
+        return None
+    if "pace" in settings:  # of a fit
+        usual = FitSettings()
+        if settings["pace"] != usual.pace or settings.get("decay", usual.decay) != usual.decay:
+            return None
+        return next_decibel_of_fit(made.history[-1].seconds, made.history[-1].step)
+    return next_decibel(judged.seconds, judged.residuals)
+
+
+def price_text(made: Reconstruction) -> str:
+    """The time of the next dB as text; empty if it is not known."""
+    price, judged = price_of_decibel(made), residual_curve(history_arrays(made.history))
+    if price is None or judged is None:
+        return ""
+    by_others = price.of == "volume"
+    if not price.measurable:
+        of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
+        return f"none {'in' if by_others else 'measurable in'} {of_what}"
+    high = f"to {duration_text(price.high)}" if math.isfinite(price.high) else "or far more"
+    span = f"{duration_text(price.low)} {high}"
+    source = "as longer fits gained on four other scans"
+    if not by_others:
+        source = f"from the residual of {judged.views} as it fell"
+    return f"about {duration_text(price.seconds)} more ({span}), {source}"

@@ -19,7 +19,6 @@ from beamline.core.events import (
     ReconDone,
     Sink,
     StateEntered,
-    VolumeDone,
     Warned,
     event_of,
 )
@@ -224,7 +223,7 @@ class LiveReconstruction:
                 self._enough(
                     f"{n} of {planned} views are enough, the others would add {mean:.2f} dB ({low:.2f} to {high:.2f})"
                 )
-            case VolumeDone() | Done():
+            case Done():
                 self._done = event.data
                 event = ReconDone(self._done)
             case Failed(message=message):

@@ -6,17 +6,22 @@ of some methods are Protocols beside it.
 
 from __future__ import annotations
 
+import json
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
+import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
+from recon.base.picture import html, middle_slices
 from recon.base.volume import Grid, Volume
 
 Plain = str | int | float
@@ -110,19 +115,52 @@ class ReconProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class MethodResult:
-    """The result of a method; attributes as in `recon.Reconstruction`.
+class Reconstruction:
+    """A reconstructed volume, with what its method says of itself: what `Method.run` and `recon.reconstruct` return.
 
-    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import. `method` names the
-    chosen method, if a method chose another one.
+    Attributes:
+        volume: the attenuation, `volume.data` float32 [z, y, x] in 1/mm.
+        settings: every parameter that was used.
+        history: the record of the fit or the iterations, empty for a direct method.
+        gaussians: the model behind the volume of a fit, a `recon.splatting.gaussians.Gaussians`, which this module
+            must not import; None for other methods.
+        checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
+        method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
+        seconds: wall time of the reconstruction, which the caller of `run` measures.
+        deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
     """
 
     volume: Volume
     settings: Mapping[str, Any]
-    history: tuple[Progress, ...] = ()
+    history: Sequence[Progress] = ()
     gaussians: Any = None
     checkpoint: Mapping[str, NDArray[Any]] | None = None
-    method: str | None = None
+    method: str = ""
+    seconds: float = 0.0
+    deviation: Volume | None = None
+
+    def __repr__(self) -> str:
+        model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
+        return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the volume's middle slices, its method and its settings."""
+        pixels, (low, high) = middle_slices(self.volume.data)
+        facts = {"result": repr(self)[15:-1], "grey": f"black {low:.4g}, white {high:.4g}"}
+        if self.history and math.isfinite(self.history[-1].residual):
+            facts["residual"] = f"{self.history[-1].residual:.4g} after {self.history[-1].step} steps"
+        return html(f"Reconstruction by {self.method}", pixels, facts)
+
+    def save(self, path: str | Path) -> None:
+        """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
+
+        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays.
+        """
+        settings = {name: value for name, value in self.settings.items() if not isinstance(value, np.ndarray)}
+        self.volume.save(path, method=self.method, seconds=self.seconds, settings=json.dumps(settings, default=str))
+
+
+MethodResult = Reconstruction  # under this name methods of other packages know it
 
 
 @dataclass(frozen=True)
@@ -170,7 +208,7 @@ class Method(Protocol):
     label: ClassVar[str]
     traits: ClassVar[Traits]
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """Reconstruct.
 
         Raises:

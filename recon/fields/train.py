@@ -18,7 +18,7 @@ from torch import Tensor
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, Traits
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
 from recon.fields.networks import Field
 from recon.fields.rays import Places, drawn, rays_of
@@ -81,7 +81,7 @@ class FieldMethod(ABC):
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
             raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return fit_field(self, problem, control)
 
     @abstractmethod
@@ -138,7 +138,7 @@ class _Views:
         return float(self.data.reshape(len(self.data), -1)[:, pixels].sum()) / max(lengths, 1e-9)
 
 
-def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -> MethodResult:
+def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Fit the field to the views, and take its density at the centres of voxels.
 
     Raises:
@@ -186,7 +186,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
         )
     record = {**asdict(method), "steps": fit.step, "planned_steps": method.steps, "seed": problem.seed}
     record |= {"held_out": tuple(kept.tolist()), "device": problem.device, "density_unit": unit}
-    return MethodResult(volume, record, tuple(fit.history))
+    return Reconstruction(volume, record, tuple(fit.history))
 
 
 class _Best(NamedTuple):

@@ -14,7 +14,7 @@ from recon.assess.plans import PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, MethodResult, Plain, ReconProblem, RunControl, Traits
+from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
@@ -99,7 +99,7 @@ class R2:
     def finish_sweeps(self) -> int:
         return SWEEPS if self.finish is None else self.finish
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_fit(self, problem, control)
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:

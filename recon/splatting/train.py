@@ -18,7 +18,7 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
+from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.ray_width import NO_WIDTH
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
@@ -96,7 +96,7 @@ class _HeldOutTracker:
                 self.kept = arrays_of(state, self.problem.backend)
 
 
-def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> MethodResult:
+def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Fit the line integrals of a problem; see `R2`.
 
     Raises:
@@ -247,7 +247,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
     checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()
-    return MethodResult(volume, record, tuple(history), model, checkpoint)
+    return Reconstruction(volume, record, tuple(history), model, checkpoint)
 
 
 def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:

@@ -14,7 +14,7 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, Traits
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
@@ -146,7 +146,7 @@ class Fbp:
         if self.filter not in get_args(Filter):
             raise ValueError(f"filter must be one of {', '.join(get_args(Filter))}, got {self.filter!r}")
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]
         begin, views = control.now(), problem.geometry.n_views
 
@@ -156,7 +156,7 @@ class Fbp:
                 control.on_progress(Progress(done, slices, control.now() - begin, nan, nan, 0, views, unit="slices"))
 
         data = direct(filled, problem.geometry, problem.grid, self.filter, progress)
-        return MethodResult(Volume(data, problem.grid), {"filter": self.filter})
+        return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def toy(self) -> Self:
         return self

@@ -21,7 +21,7 @@ from numba import get_num_threads, set_num_threads
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.voxel_problem import VoxelProblem
@@ -119,7 +119,7 @@ def solve(
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
 
 
-def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunControl) -> MethodResult:
+def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """`Method.run` of an iterative method, whose settings are a dataclass.
 
     Raises:
@@ -144,7 +144,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
         on_iteration=report, on_trial=control.stop_trials or control.should_stop, decide=decide,
     )  # fmt: skip
-    return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
+    return Reconstruction(volume, {**settings, "seed": problem.seed}, tuple(history))
 
 
 class _Units(NamedTuple):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import recon
 from recon.auto import Auto
 from recon.base.decisions import Decisions
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Volume
 from recon.splatting.r2 import R2
 from recon.trials import shared_decisions
@@ -48,7 +48,7 @@ class Scaled(Fbp):
 
     factor: float = 1.0
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         found = super().run(problem, control)
         volume = Volume(found.volume.data * np.float32(self.factor), found.volume.grid)
         return replace(
@@ -123,7 +123,7 @@ def test_a_volume_that_hides_a_thin_crack_is_not_preferred_where_residuals_are_l
 def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
     @dataclass(frozen=True)
     class Refusing(Fbp):
-        def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+        def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
             raise ValueError("not these")
 
     assert recon.reconstruct(data, VIEWS, Auto((Refusing(), Scaled()))).settings["factor"] == 1.0
@@ -134,8 +134,8 @@ def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
 def test_where_nothing_can_be_tried_the_first_one_runs(data: F32) -> None:
     @dataclass(frozen=True)
     class Blank(Fbp):
-        def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
-            return MethodResult(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
+        def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+            return Reconstruction(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
 
     found = recon.reconstruct(data[:12], VIEWS.select(np.arange(0, 24, 2)), Auto((Blank(), Scaled())))
     assert "12 views are too few" in found.settings["chosen_because"]
@@ -168,7 +168,7 @@ class Fit(R2):
 
     tried: list[int | None] = field(default_factory=list)
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         self.tried.append(self.finish)
         return Scaled(factor=0.5 if self.finish is None else 1.0).run(problem, control)
 

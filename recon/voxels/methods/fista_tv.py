@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
@@ -47,7 +47,7 @@ class FistaTv:
         if self.subsets < 1 or self.tv_steps < 1:
             raise ValueError(f"subsets and tv_steps must be 1 or more, got {self.subsets} and {self.tv_steps}")
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, Traits
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.emission import Emission, mlem
 from recon.voxels.voxel_problem import iterative_memory
@@ -30,7 +30,7 @@ class Mlem:
 
     iterations: int = 50
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return _run(self, problem, control, 1)
 
     def toy(self) -> Self:
@@ -51,7 +51,7 @@ class Osem:
     iterations: int = 20
     subsets: int = 10
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return _run(self, problem, control, self.subsets)
 
     def toy(self) -> Self:
@@ -61,7 +61,7 @@ class Osem:
         return _memory(geometry, grid, weighted, min(self.subsets, geometry.n_views))
 
 
-def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subsets: int) -> MethodResult:
+def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subsets: int) -> Reconstruction:
     begin, views = control.now(), problem.geometry.n_views
     history: list[Progress] = []
 
@@ -73,7 +73,7 @@ def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subset
         return control.should_stop is not None and control.should_stop()
 
     volume = mlem(_emission(problem), problem.grid, method.iterations, min(subsets, views), report)
-    return MethodResult(volume, {f.name: getattr(method, f.name) for f in fields(method)}, tuple(history))
+    return Reconstruction(volume, {f.name: getattr(method, f.name) for f in fields(method)}, tuple(history))
 
 
 def _emission(problem: ReconProblem) -> Emission:

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
@@ -51,7 +51,7 @@ class OsSirtTv:
         if self.tv_weight is not None and not 0 <= self.tv_weight < math.inf:
             raise ValueError(f"tv_weight must be finite and 0 or more, got {self.tv_weight}")
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

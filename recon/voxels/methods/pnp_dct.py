@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out_weight import (
@@ -59,7 +59,7 @@ class PnpDct:
         """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
         return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * PnpDct().iterations
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

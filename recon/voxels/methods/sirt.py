@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
@@ -28,7 +28,7 @@ class Sirt:
     relaxation: float = 1.0
     allow_negative: bool = False
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:

@@ -98,7 +98,9 @@ def test_frames_that_are_there_of_a_scan_that_died(run: Path) -> None:
 
 def _volume(value: float) -> ReconRecord:
     volume = recon.Volume(np.full((2, 3, 3), value, np.float32), recon.Grid((2, 3, 3), 0.1))
-    return ReconRecord(volume, "mm", "scan.h5", "a", "b", 0.0, {"n_views": 1})
+    return ReconRecord(
+        volume=volume, length_unit="mm", raw_file="scan.h5", title="a", sample="b", time=0.0, parameters={"n_views": 1}
+    )
 
 
 def test_the_live_volume_each_time_that_it_is_new_then_the_finished_one(run: Path) -> None:

@@ -23,10 +23,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from beamline.study import run as study_run
-from beamline.tradeoff import run as tradeoff_run
-from beamline.tradeoff.data import write_array
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import study as study_run
+from beamline.trials import tradeoff as tradeoff_run
+from beamline.trials.data import write_array
+from beamline.trials.trial import Outcome, Trial
 
 _FAULTS = {
     "none": (0, 0, 0, 0),
@@ -40,8 +40,8 @@ _MODULES = {
     "archive": "cli.files",
     "recon": "cli.recon reconstruct.finished reconstruct.recon_report report.figures",
     "segment": "cli.segment",
-    "tradeoff": "cli.tradeoff tradeoff.run",
-    "study": "cli.study study.run study.figures",
+    "tradeoff": "cli.tradeoff trials.tradeoff",
+    "study": "cli.study trials.study trials.study_figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 

@@ -6,6 +6,7 @@ import json
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -15,7 +16,8 @@ from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.stop import StopRequest
-from beamline.storage.writers.recon_file import read_reconstruction
+from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
+from recon.base.volume import Grid, Volume
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -116,10 +118,21 @@ def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest
     def fake(config: Config, runs: Path | None, sinks: list, stop: StopRequest, command: str) -> None:
         asked.append((config, runs))
         assert threading.current_thread() is threading.main_thread()
-        done = VolumeDone(
-            Path("runs/x/recon.h5"), Path("runs/x/report.html"), "r2", 17.0, 9, (2, 3, 4), "1/mm", 1.0, {},
-            {"psnr": 30.0}, fbp={"psnr": 25.0}, time=0.0,
-        )  # fmt: skip
+        record = ReconRecord(
+            volume=Volume(np.zeros((2, 3, 4), np.float32), Grid((2, 3, 4))),
+            length_unit="mm",
+            raw_file="scan.h5",
+            title="t",
+            sample="s",
+            time=0.0,
+            parameters={"method": "r2", "axis_col": 17.0, "n_views": 9},
+            metrics={"psnr": 30.0},
+            compared={"psnr": 25.0},
+            output=Path("runs/x/recon.h5"),
+            report=Path("runs/x/report.html"),
+            elapsed=1.0,
+        )
+        done = VolumeDone(record, time=0.0)
         for sink in sinks:
             sink(done)
 

@@ -22,7 +22,18 @@ VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
 @pytest.fixture
 def volume(folder: Path) -> Path:
     grid = Grid(VALUES.shape, 0.5)
-    write_volume(folder / "v.h5", ReconRecord(Volume(VALUES, grid), "mm", "scan.h5", "t", "s", 0.0, {"method": "fbp"}))
+    write_volume(
+        folder / "v.h5",
+        ReconRecord(
+            volume=Volume(VALUES, grid),
+            length_unit="mm",
+            raw_file="scan.h5",
+            title="t",
+            sample="s",
+            time=0.0,
+            parameters={"method": "fbp"},
+        ),
+    )
     return folder
 
 

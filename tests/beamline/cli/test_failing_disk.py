@@ -48,7 +48,15 @@ def inputs(tmp_path: Path, rng: np.random.Generator) -> Path:
     z, y, x = np.indices(data.shape)
     for centre in ((6, 8, 8), (13, 15, 19)):
         data[(z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2 < 20] += 1
-    record = ReconRecord(Volume(data, Grid(data.shape, 0.01)), "mm", "scan.h5", "t", "s", 0.0, {"method": "fbp"})
+    record = ReconRecord(
+        volume=Volume(data, Grid(data.shape, 0.01)),
+        length_unit="mm",
+        raw_file="scan.h5",
+        title="t",
+        sample="s",
+        time=0.0,
+        parameters={"method": "fbp"},
+    )
     write_reconstruction(tmp_path / "volume.h5", record)
     np.save(tmp_path / "volume.npy", data)
     os.utime(tmp_path / "volume.npy", (0, 0))

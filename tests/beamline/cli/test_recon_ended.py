@@ -17,7 +17,7 @@ from beamline.reconstruct import budget, checkpoints
 from beamline.reconstruct import finished as offline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
-from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.splatting import optimise as fit
 from recon.splatting import train
 from recon.splatting.initialise import place
@@ -139,7 +139,7 @@ def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
 ) -> None:
     run = direct.Fbp.run
 
-    def interrupted(method: direct.Fbp, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def interrupted(method: direct.Fbp, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if problem.geometry.n_views == SCAN.angles.size:  # not the toy that is reconstructed before
             signal.raise_signal(signal.SIGINT)
         return run(method, problem, control)

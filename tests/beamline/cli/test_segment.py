@@ -48,7 +48,18 @@ def _rows(path: Path) -> list[dict[str, float]]:
 def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> None:
     data = can()
     grid = Grid(data.shape, VOXEL, CENTRE)  # type: ignore[arg-type]
-    write_reconstruction(here / "recon.h5", ReconRecord(Volume(data, grid), "mm", "scan.h5", "t", "s", 0.0, {}))
+    write_reconstruction(
+        here / "recon.h5",
+        ReconRecord(
+            volume=Volume(data, grid),
+            length_unit="mm",
+            raw_file="scan.h5",
+            title="t",
+            sample="s",
+            time=0.0,
+            parameters={},
+        ),
+    )
     result = beamline("segment", "recon.h5", *MARGIN)
     assert result.exit_code == 0, result.output
     assert left(here) == {"recon.h5", "recon_particles.h5", "recon_particles.csv", "recon_particles.png"}
@@ -86,7 +97,15 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
 @pytest.mark.usefixtures("undrawn")
 def test_error_bars_in_the_file_give_each_volume_an_interval(here: Path) -> None:
     data = can(noise=0.02)
-    record = ReconRecord(Volume(data, Grid(data.shape, VOXEL)), "mm", "scan.h5", "t", "s", 0.0, {})  # type: ignore[arg-type]
+    record = ReconRecord(
+        volume=Volume(data, Grid(data.shape, VOXEL)),
+        length_unit="mm",
+        raw_file="scan.h5",
+        title="t",
+        sample="s",
+        time=0.0,
+        parameters={},
+    )  # type: ignore[arg-type]
     rows = []
     for deviation in (None, np.full_like(data, 0.05), np.full_like(data, 0.4)):
         write_reconstruction(here / "v.h5", replace(record, deviation=deviation), replace=True)

@@ -14,10 +14,10 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.study import run as study_run
-from beamline.study.figures import SliceSheet
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import study as study_run
+from beamline.trials.data import Data
+from beamline.trials.study_figures import SliceSheet
+from beamline.trials.trial import Outcome, Trial
 from recon.base.volume import Grid
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.tradeoff import run as tradeoff
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import tradeoff as tradeoff
+from beamline.trials.trial import Outcome, Trial
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))

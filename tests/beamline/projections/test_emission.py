@@ -20,14 +20,14 @@ from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
-from beamline.study.run import Rig
-from beamline.study.studies import StudyRow
-from beamline.tradeoff.compared import split
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.opened import ComparedScan
-from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
-from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.worker import run
+from beamline.trials.compared import split
+from beamline.trials.data import Data
+from beamline.trials.opened import ComparedScan
+from beamline.trials.study import Rig
+from beamline.trials.tradeoff import TradeoffOptions, run_tradeoff
+from beamline.trials.trial import Trial
+from beamline.trials.view_choices import StudyRow
+from beamline.trials.worker import run
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared
 from simulators.scenes.emission import events, load_emission

@@ -26,7 +26,7 @@ from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
-from recon.base.method import Method, MethodResult, ReconProblem, RunControl
+from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
@@ -203,7 +203,7 @@ class Costly(OsSirtTv):
     factor: float = 1.0
     ran: list[tuple[int, int]] = field(default_factory=list)
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         rows = problem.geometry.detector_shape[0]
         self.ran.append((rows, self.iterations))
         found = OsSirtTv(iterations=5).run(problem, RunControl())
@@ -246,9 +246,9 @@ def test_without_a_trial_the_curves_of_other_scans_decide(
     assert late.because.endswith("too little time") and late.seconds >= 12.0
 
 
-def _wait(clock: Ticking, seconds: float, problem: ReconProblem) -> MethodResult:
+def _wait(clock: Ticking, seconds: float, problem: ReconProblem) -> Reconstruction:
     clock.time += seconds
-    return MethodResult(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
+    return Reconstruction(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
 
 
 def test_a_method_on_voxels_ends_in_time_with_what_it_has(

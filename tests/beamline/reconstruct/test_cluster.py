@@ -20,7 +20,7 @@ from beamline.reconstruct.cluster import Cluster, WorkersLostError, check_cluste
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl
+from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.voxels.methods.sirt import Sirt
 from tests.beamline.cli.small_scan import beamline, left
@@ -36,7 +36,7 @@ class DiesOnce(Sirt):
 
     marker: str = ""
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if not Path(self.marker).exists():
             Path(self.marker).touch()
             os._exit(1)

@@ -20,14 +20,13 @@ from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct.follow import follow
 from beamline.reconstruct.growing import ScanFollower
-from beamline.reconstruct.outcome import ReconOutcome
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
-from recon.base.method import Progress
+from recon.base.method import Progress, Reconstruction
 from recon.prep.correct import Correction, Projections, Transmission
 from recon.splatting.stream import StreamingFit
 from recon.voxels.enough_views import Goal
@@ -143,7 +142,7 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
         fits.append(self)
         return finish(self, *rest)
 
-    def write_and_keep(outcome: ReconOutcome, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
         judged.append(prepared)
         return write(outcome, prepared, *rest)
 
@@ -195,7 +194,7 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
         live.append(self._joined())
         again(self, usable, why)
 
-    def write_and_keep(outcome: ReconOutcome, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
         judged.append(prepared)
         return write(outcome, prepared, *rest)
 

@@ -17,6 +17,7 @@ from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import SystemClock
 from recon.methods import build, by_name
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -36,15 +37,15 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_exchange(tmp_path_factory.mktemp("scan") / "scan.h5", made, changes)
 
 
-def figures(scan: Path, folder: Path, method: str, axis_col: float) -> VolumeDone:
-    """The event `done` of a reconstruction with a report."""
+def figures(scan: Path, folder: Path, method: str, axis_col: float) -> ReconRecord:
+    """The record of a reconstruction with a report."""
     heard: list[Event] = []
     made = build(by_name(method), METHODS[method])
     target = OutputPaths(folder / f"{method}_{axis_col}.h5", folder / f"{method}_{axis_col}.html")
     options = ReconOptions(SourceOptions(scan), target, Selection(axis_col=axis_col), made)
     reconstruct_file(options, heard.append, SystemClock(), StopOnSignal())
     (done,) = (event for event in heard if isinstance(event, VolumeDone))
-    return done
+    return done.record
 
 
 def test_snr_and_cnr_of_fbp_are_the_same_beside_every_method(scan: Path, tmp_path: Path) -> None:
@@ -52,7 +53,7 @@ def test_snr_and_cnr_of_fbp_are_the_same_beside_every_method(scan: Path, tmp_pat
     assert "unexplained" not in alone  # the blur of its filter tells nothing
     for method in ("sirt", "cgls", "fista-tv"):
         done = figures(scan, tmp_path, method, 23.5)
-        beside = done.fbp
+        beside = done.compared
         assert beside is not None and "unexplained" in done.metrics
         assert abs(beside["air"]) < 1  # the ring around the cylinder, no corners and no matter
         assert {name: beside[name] for name in ("snr", "cnr")} == {name: alone[name] for name in ("snr", "cnr")}

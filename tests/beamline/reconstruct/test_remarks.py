@@ -10,9 +10,9 @@ import pytest
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import measure, uniform_residual
-from beamline.reconstruct.outcome import ReconOutcome
 from beamline.reconstruct.remarks import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.prep.correct import Projections
 from recon.splatting.gaussians import Gaussians
@@ -22,7 +22,9 @@ from recon.voxels.stray_mass import stray_mass
 FIRST_FRAME, FIRST_ROW = 20, 30
 
 
-def _made(rng: np.random.Generator, specks: dict[int, float], method: str) -> tuple[ReconOutcome, PreparedProjections]:
+def _made(
+    rng: np.random.Generator, specks: dict[int, float], method: str
+) -> tuple[Reconstruction, PreparedProjections]:
     """A ball in views of which some have a speck in their middle, binned 2 x 2 from rows 30 to 78 of frames 20 on."""
     geometry = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (24, 48))
     grid = Grid.matching(geometry)
@@ -34,7 +36,7 @@ def _made(rng: np.random.Generator, specks: dict[int, float], method: str) -> tu
     frames = FIRST_FRAME + np.arange(40)
     projections = Projections(data, frames, 0.0, np.ones(40, np.float32), np.zeros((24, 48), bool))
     prepared = PreparedProjections(projections, geometry, 0.0, None, None, 40, "mm", "counts")
-    return ReconOutcome(volume, method, 1.0, (), {}), prepared
+    return Reconstruction(volume, {}, method=method, seconds=1.0), prepared
 
 
 def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:

@@ -19,7 +19,7 @@ from beamline.page.volume import ShownVolume
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.result import write_result
 from beamline.report import figures
@@ -27,6 +27,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
@@ -56,10 +57,9 @@ def _scan(folder: Path, turn: float) -> tuple[PreparedProjections, ReportContext
 def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
     prepared, context = _scan(tmp_path, turn)
     result = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.OsSirtTv(iterations=3))
-    made = ReconOutcome(result.volume, "os-sirt-tv", result.seconds, result.history, result.settings)
     events: list[Event] = []
     write_result(
-        made,
+        result,
         prepared,
         None,
         OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
@@ -86,7 +86,7 @@ def test_fbp_is_kept_beside_a_volume_that_hides_something(tmp_path: Path, doubtf
         volume = replace(volume, data=gaussian_filter(volume.data, (0, 2, 2)))
     events: list[Event] = []
     target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
-    made = ReconOutcome(volume, "fista-tv", 1.0, (), {})
+    made = Reconstruction(volume, {}, method="fista-tv", seconds=1.0)
     context = ReportContext(facts, selection, "beamline recon scan.h5", 0)
     write_result(made, prepared, None, target, context, events.append, SystemClock())
     record = read_reconstruction(target.output)
@@ -113,7 +113,7 @@ def test_fbp_that_another_format_cannot_keep_is_told(tmp_path: Path) -> None:
         prepared = prepare_projections(source, selection, lambda said: None)
     grid = Grid.matching(prepared.geometry)
     sharp = direct(prepared.projections.data, prepared.geometry, grid, "hann")
-    made = ReconOutcome(Volume(gaussian_filter(sharp, (0, 2, 2)), grid), "fista-tv", 1.0, (), {})
+    made = Reconstruction(Volume(gaussian_filter(sharp, (0, 2, 2)), grid), {}, method="fista-tv", seconds=1.0)
     events: list[Event] = []
     target = OutputPaths(tmp_path / "out.npy", tmp_path / "out.html")
     context = ReportContext(facts, selection, "beamline recon scan.h5", 0)

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beamline.reconstruct.outcome import ReconOutcome
-from beamline.report.record import history_arrays, history_from, residual_curve
+from beamline.report.record import history_arrays, history_from, price_of_decibel, price_text, residual_curve
 from beamline.report.time_curves import quality_against_time
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
-from recon.base.method import Progress
+from recon.base.method import Progress, Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.settings import FitSettings
@@ -30,9 +29,9 @@ def _record(slope: float, n: int = 60, views: int = 12) -> tuple[Progress, ...]:
     return tuple(Progress(k + 1, n, t, r / 2, r, 100, views) for k, (t, r) in enumerate(pairs))
 
 
-def _made(history: tuple[Progress, ...], method: str = "sirt") -> ReconOutcome:
+def _made(history: tuple[Progress, ...], method: str = "sirt") -> Reconstruction:
     settings = {"pace": FitSettings().pace} if method == "r2" else {}
-    return ReconOutcome(Volume(np.zeros(GRID.shape, np.float32), GRID), method, 1.0, history, settings)
+    return Reconstruction(Volume(np.zeros(GRID.shape, np.float32), GRID), settings, history, method=method, seconds=1.0)
 
 
 def test_there_and_back() -> None:
@@ -73,28 +72,28 @@ def test_each_look_at_views_held_out_counts_once() -> None:
 
 def test_a_fit_says_what_longer_fits_gained() -> None:
     made = _made(_record(3.0), "r2")
-    assert made.next_decibel == next_decibel_of_fit(30.0, 60)
-    assert "as longer fits gained on four other scans" in made.next_decibel_text
+    assert price_of_decibel(made) == next_decibel_of_fit(30.0, 60)
+    assert "as longer fits gained on four other scans" in price_text(made)
     late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
     followed = replace(
         _made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace, "decay": WHILE_VIEWS_COME.decay}
     )
-    assert followed.next_decibel is None and followed.next_decibel_text == ""
-    assert _made(late, "r2").next_decibel_text == "none in reach of what was measured"
+    assert price_of_decibel(followed) is None and price_text(followed) == ""
+    assert price_text(_made(late, "r2")) == "none in reach of what was measured"
 
 
 def test_iterations_say_what_another_decibel_would_cost() -> None:
     made = _made(_record(3.0))
-    assert made.next_decibel is not None
-    assert made.next_decibel.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
-    assert made.next_decibel_text.startswith("about 11.9 s more (")
-    assert "none measurable" in _made(_record(0.0)).next_decibel_text
-    assert _made(()).next_decibel is None and _made(()).next_decibel_text == ""
+    price = price_of_decibel(made)
+    assert price is not None and price.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
+    assert price_text(made).startswith("about 11.9 s more (")
+    assert "none measurable" in price_text(_made(_record(0.0)))
+    assert price_of_decibel(_made(())) is None and price_text(_made(())) == ""
 
 
 def test_while_views_still_come_nothing_is_extrapolated() -> None:
     grown = (*_record(3.0), *_record(3.0, views=20))
-    assert _made(grown).next_decibel is None
+    assert price_of_decibel(_made(grown)) is None
 
 
 @pytest.mark.parametrize("slope", [3.0, 0.0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 
@@ -23,11 +23,11 @@ class Mean:
     traits: ClassVar[Traits] = Traits(direct=True)
     share: float = 0.5
 
-    def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         views = masked(problem.projections, problem.use.weights)[0]
         sharp, smooth = (direct(views, problem.geometry, problem.grid, name) for name in ("ram-lak", "hann"))
         data = (self.share * sharp + (1 - self.share) * smooth).astype(np.float32)
-        return MethodResult(Volume(data, problem.grid), {"share": self.share})
+        return Reconstruction(Volume(data, problem.grid), {"share": self.share})
 
     def toy(self) -> Self:
         return self

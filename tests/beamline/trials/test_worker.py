@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 import recon.warm_up
 from beamline.core.errors import DataError
-from beamline.tradeoff import worker as module
-from beamline.tradeoff.data import Data, write_array
-from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.worker import main, on_grid, run
+from beamline.trials import worker as module
+from beamline.trials.data import Data, write_array
+from beamline.trials.trial import Trial
+from beamline.trials.worker import main, on_grid, run
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

@@ -13,12 +13,12 @@ from typing import Any
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
-from beamline.tradeoff.trials import Outcome, Status, Trial
+from beamline.trials.trial import Outcome, Status, Trial
 
 
 def command(job: Path) -> Sequence[str]:
     """The command that runs the job in the file `job`."""
-    return [sys.executable, "-m", "beamline.tradeoff.worker", str(job)]
+    return [sys.executable, "-m", "beamline.trials.worker", str(job)]
 
 
 def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""One trial in a process of its own, so that its peak memory is its own: `python -m beamline.tradeoff.worker JOB.json`.
+"""One trial in a process of its own, so that its peak memory is its own: `python -m beamline.trials.worker JOB.json`.
 
 Reads the job and its arrays, says progress and the result as lines of JSON on stdout. A job may also be to compile what
 trials will need, once for all of them: compiling takes memory that would otherwise count as the first trial's. Its
@@ -30,10 +30,10 @@ from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
-from beamline.tradeoff.data import Data, geometry_in, write_array
-from beamline.tradeoff.joint import VolumeAt, by_parts, jointly, toy_like
-from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.varied import JOINT
+from beamline.trials.data import Data, geometry_in, write_array
+from beamline.trials.joint import VolumeAt, by_parts, jointly, toy_like
+from beamline.trials.trial import Trial
+from beamline.trials.varied import JOINT
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record

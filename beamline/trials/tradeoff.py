@@ -15,13 +15,13 @@ from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.report.slice_sheet import SliceSheet
-from beamline.tradeoff.compared import Several, compared
-from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ComparedScan, until_stopped
-from beamline.tradeoff.report import write_figures, write_table
-from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Timed, seconds_left, telling_first
-from beamline.tradeoff.varied import Depth
+from beamline.trials.compared import Several, compared
+from beamline.trials.launch import compile_kernels, run_trial
+from beamline.trials.opened import ComparedScan, until_stopped
+from beamline.trials.report import write_figures, write_table
+from beamline.trials.table import TrialTable
+from beamline.trials.trial import Outcome, Timed, seconds_left, telling_first
+from beamline.trials.varied import Depth
 from drivers.base.clock import Clock
 
 _PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most

@@ -17,13 +17,13 @@ from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.report.slice_sheet import SliceSheet
-from beamline.study.figures import write_page
-from beamline.study.studies import Study, StudyRow, ViewSet, averaged
-from beamline.study.table import Cell, StudyTable, write_table
-from beamline.tradeoff.data import Data, write_array
-from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ComparedScan, OpenedScan, opened_scan, until_stopped
-from beamline.tradeoff.trials import Outcome, Timed, Trial, in_time, seconds_left
+from beamline.trials.data import Data, write_array
+from beamline.trials.launch import compile_kernels, run_trial
+from beamline.trials.opened import ComparedScan, OpenedScan, opened_scan, until_stopped
+from beamline.trials.study_figures import write_page
+from beamline.trials.study_table import Cell, StudyTable, write_table
+from beamline.trials.trial import Outcome, Timed, Trial, in_time, seconds_left
+from beamline.trials.view_choices import Study, StudyRow, ViewSet, averaged
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32

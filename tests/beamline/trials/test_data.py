@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beamline.tradeoff.data import Data, geometry_in
+from beamline.trials.data import Data, geometry_in
 from recon.base.geometry import Geometry
 
 

@@ -10,8 +10,8 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
-from beamline.tradeoff.compared import Several, compared
-from beamline.tradeoff.opened import ComparedScan
+from beamline.trials.compared import Several, compared
+from beamline.trials.opened import ComparedScan
 from recon.base.geometry import Geometry
 from simulators.light.palette import known
 from tests.beamline.cli.test_materials import ENERGIES, scans, spectra  # noqa: F401 - scans is a fixture

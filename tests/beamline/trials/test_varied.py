@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from beamline.tradeoff import varied
-from beamline.tradeoff.varied import Depth, colour_of, trials_of, work_of
+from beamline.trials import varied
+from beamline.trials.varied import Depth, colour_of, trials_of, work_of
 from recon import methods
 
 

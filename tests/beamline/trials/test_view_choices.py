@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.study.studies import STUDIES, StudyRow, ViewSet, averaged
+from beamline.trials.view_choices import STUDIES, StudyRow, ViewSet, averaged
 
 HALF_TURN = np.radians(np.arange(1800) * 0.1)
 

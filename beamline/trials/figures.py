@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from beamline.report.figures import png
-from beamline.tradeoff.trials import Outcome, Trial
-from beamline.tradeoff.varied import colour_of
+from beamline.trials.trial import Outcome, Trial
+from beamline.trials.varied import colour_of
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn

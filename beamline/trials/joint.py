@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.varied import MOTION
+from beamline.trials.data import Data
+from beamline.trials.trial import Trial
+from beamline.trials.varied import MOTION
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid

@@ -14,9 +14,9 @@ import pytest
 from beamline.core.machine import machine
 from beamline.report.html import Picture
 from beamline.report.slice_sheet import SliceSheet
-from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
-from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Trial, plan, plan_in_equal_time
+from beamline.trials.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
+from beamline.trials.table import TrialTable
+from beamline.trials.trial import Outcome, Trial, plan, plan_in_equal_time
 from recon.methods import names
 from tests.beamline.html_page import parsed_page
 

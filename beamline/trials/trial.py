@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from beamline.tradeoff.varied import JOINT, MOTION, Depth, ended_by_time, trials_of, work_of
+from beamline.trials.varied import JOINT, MOTION, Depth, ended_by_time, trials_of, work_of
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name
 
@@ -24,7 +24,7 @@ class Trial:
 
     Attributes:
         group: what it varies: "method" where nothing.
-        method: its name in `recon.methods`, or in `beamline.tradeoff.varied.JOINT`.
+        method: its name in `recon.methods`, or in `beamline.trials.varied.JOINT`.
         views: how many, spread evenly over those chosen.
         binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.

@@ -17,9 +17,9 @@ from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.shipped import version
 from beamline.projections.scan_statistics import Light
-from beamline.study.studies import Study, StudyRow
-from beamline.tradeoff.report import finite
-from beamline.tradeoff.trials import Status
+from beamline.trials.report import finite
+from beamline.trials.trial import Status
+from beamline.trials.view_choices import Study, StudyRow
 
 _WIDTH = 120  # characters
 

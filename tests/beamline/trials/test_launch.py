@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.tradeoff import launch as trial_run
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.trials import Trial, plan
+from beamline.trials import launch as trial_run
+from beamline.trials.data import Data
+from beamline.trials.launch import compile_kernels, run_trial
+from beamline.trials.trial import Trial, plan
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.scans import TwoCylinders

@@ -19,10 +19,10 @@ from beamline.reconstruct.energy_views import energy_views, read_spectra
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.time_series import times_of
 from beamline.storage.readers.open import SourceOptions
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.opened import ComparedScan, opened_scan
-from beamline.tradeoff.trials import Trial, plan, plan_in_equal_time, plan_in_time, plan_of_energies
-from beamline.tradeoff.varied import Depth
+from beamline.trials.data import Data
+from beamline.trials.opened import ComparedScan, opened_scan
+from beamline.trials.trial import Trial, plan, plan_in_equal_time, plan_in_time, plan_of_energies
+from beamline.trials.varied import Depth
 from recon.base.arrays import F32
 from recon.base.volume import Grid
 from recon.methods import names_compared

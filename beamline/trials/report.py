@@ -18,10 +18,10 @@ from beamline.core.shipped import version
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
 from beamline.report.slice_sheet import SliceSheet
-from beamline.tradeoff import pareto
-from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
-from beamline.tradeoff.trials import Outcome
+from beamline.trials import pareto
+from beamline.trials.figures import cost_curves, pareto_plot
+from beamline.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
+from beamline.trials.trial import Outcome
 from recon.assess.time_model import duration_text
 
 _FIELDS = ("group", "method", "views", "binning")

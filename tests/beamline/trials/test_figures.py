@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from beamline.tradeoff import figures as tradeoff_figures
-from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import figures as tradeoff_figures
+from beamline.trials.figures import cost_curves, pareto_plot
+from beamline.trials.trial import Outcome, Trial
 
 FBP, FIT = Trial("method", "fbp", 10), Trial("method", "r2", 10, settings={"steps": 100})
 FEW = Trial("views", "r2", 5, settings={"steps": 100})

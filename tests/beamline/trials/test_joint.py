@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.tradeoff import joint, worker
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.joint import by_parts, jointly
-from beamline.tradeoff.trials import Trial, plan_in_time, plan_of_energies, work
-from beamline.tradeoff.worker import main, ready, run, shown
+from beamline.trials import joint, worker
+from beamline.trials.data import Data
+from beamline.trials.joint import by_parts, jointly
+from beamline.trials.trial import Trial, plan_in_time, plan_of_energies, work
+from beamline.trials.worker import main, ready, run, shown
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

@@ -10,8 +10,8 @@ import numpy as np
 
 from beamline.core.events import TrialDone
 from beamline.projections.scan_statistics import Light, dose_scale
-from beamline.tradeoff import pareto
-from beamline.tradeoff.trials import Outcome
+from beamline.trials import pareto
+from beamline.trials.trial import Outcome
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach

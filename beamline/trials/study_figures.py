@@ -14,8 +14,8 @@ from beamline.projections.scan_statistics import dose_scale
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
 from beamline.report.slice_sheet import SliceSheet
-from beamline.study.table import HEADINGS, StudyTable, formatted
-from beamline.tradeoff.varied import colour_of
+from beamline.trials.study_table import HEADINGS, StudyTable, formatted
+from beamline.trials.varied import colour_of
 from recon.methods import by_name
 
 

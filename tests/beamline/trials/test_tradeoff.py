@@ -19,12 +19,12 @@ from beamline.core.events import Event
 from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
-from beamline.tradeoff import run as tradeoff
-from beamline.tradeoff.opened import ComparedScan
-from beamline.tradeoff.report import text
-from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
-from beamline.tradeoff.table import TIME
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import tradeoff as tradeoff
+from beamline.trials.opened import ComparedScan
+from beamline.trials.report import text
+from beamline.trials.table import TIME
+from beamline.trials.tradeoff import TradeoffOptions, run_tradeoff
+from beamline.trials.trial import Outcome, Trial
 from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry

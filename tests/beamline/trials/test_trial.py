@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.tradeoff.trials import Outcome, Timed, Trial, decibels, plan, plan_in_equal_time, seconds_left, work
+from beamline.trials.trial import Outcome, Timed, Trial, decibels, plan, plan_in_equal_time, seconds_left, work
 from recon.base.method import BoundedMethod
 from recon.methods import by_name, names
 

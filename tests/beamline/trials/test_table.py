@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beamline.core.machine import machine
-from beamline.tradeoff.report import conclusions
-from beamline.tradeoff.table import LEAST_GAIN, MEMORY, TIME, TrialTable
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials.report import conclusions
+from beamline.trials.table import LEAST_GAIN, MEMORY, TIME, TrialTable
+from beamline.trials.trial import Outcome, Trial
 
 
 def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
