@@ -19,6 +19,7 @@ from beamline.core.events import (
     StateEntered,
     Warned,
 )
+from beamline.core.run_result import RunResult
 from beamline.epics.ioc import RunValues, Severity, Stamp, StampedValues
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
@@ -61,7 +62,7 @@ def test_flags_are_counted_by_level(level: str, warnings: int, alarms: int) -> N
 
 
 def test_the_end_leaves_no_rate() -> None:
-    done = ScanDone(Path("a"), 20, [], {}, 0, 0, 0, [], 60.0, 1000, None, "complete")
+    done = ScanDone(RunResult(Path("a"), 20, [], {}, 0, 0, 0, [], 60.0, 1000, None, "complete"))
     now = _after(STARTED, FRAME, done)
     assert math.isnan(now.rate) and now.time_left == 0
 
