@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from beamline.projections.flagged_frames import reasons, reference_images, worst
 from beamline.projections.returned import returned_views
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
-from beamline.report.contact_sheet import FlaggedFrame
 from beamline.report.record import history_arrays, residual_curve
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
@@ -30,6 +29,9 @@ from recon.methods import by_name
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
+
+if TYPE_CHECKING:
+    from beamline.report.contact_sheet import FlaggedFrame
 
 
 @dataclass(frozen=True)

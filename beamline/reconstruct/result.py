@@ -14,8 +14,6 @@ from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
-from beamline.reconstruct.recon_report import compose
-from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.partial_volume import complete
@@ -77,6 +75,9 @@ def write_result(
     page: Path | None = None
     try:
         if target.report is not None:
+            from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
+            from beamline.report.html import write_report
+
             report = compose(made, prepared, truth, volumes, judged.metrics, parameters, context, judged.left)
             report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
