@@ -63,7 +63,7 @@ def warm_up(
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
-    with _counted(on_kernel or (lambda n: None)):
+    with counted(on_kernel or (lambda n: None)):
         reconstruct(data, views, method.toy(), device=device, use=DataUse(weights))
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
@@ -98,7 +98,9 @@ def _rows(n: int) -> F32:
 
 
 @contextmanager
-def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
+def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
+    """Call `on_kernel` with the number of functions compiled so far, after each."""
+
     class Counter(event.Listener):
         n = 0
 

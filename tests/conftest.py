@@ -11,10 +11,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import settings
+
+import recon  # noqa: F401 - before numba: it says what processor numba compiles for
+
+# isort: split
+import numba
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
 # No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
