@@ -16,7 +16,7 @@ from beamline.cli.options import POSITIVE, parsed, together
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
-from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
+from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, MODEL_STEPS, Loss, Start
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
 from recon.methods import DEFAULT, build, by_name, has_setting, names, taking, with_trait
@@ -220,7 +220,7 @@ _STEPS = click.option(
     "--steps",
     type=click.IntRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-    f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
+    f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
 )
 _GAUSSIANS = click.option("--gaussians", type=click.IntRange(min=1), help="Number of Gaussians at the start.")
 _FINISH = click.option(

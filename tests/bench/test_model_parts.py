@@ -20,7 +20,7 @@ from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.step import PrepStep
 from beamline.projections.steps.width import Width
 from beamline.storage.readers.open import open_scan
-from recon.voxels.held_out_weight import split_views
+from recon.voxels.held_out import split_views
 from recon.voxels.projector import Projector
 from tests.recon.prep.ring_score import ring_score
 
