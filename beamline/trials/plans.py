@@ -64,7 +64,7 @@ def work_of(method: Method, n_views: int, binning: int) -> float:
         count = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians or 0
         spread = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
         return (method.planned_steps or 0) * (1 + count / 2e4 * spread**2)
-    return n_views * getattr(method, "iterations", 1) / binning**3
+    return n_views * (getattr(method, "iterations", None) or 1) / binning**3
 
 
 def _baseline(gaussians: int, depth: Depth) -> list[TrialSettings]:
@@ -77,6 +77,12 @@ def _iterations(quick: Sequence[int], full: Sequence[int], gaussians: int, depth
     base = numbers[len(numbers) // 2]
     others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
     return [TrialSettings("method", {"iterations": base}), *others]
+
+
+def _beside_chosen(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
+    """Numbers of iterations beside the one that the data choose, the baseline."""
+    numbers = {"quick": quick, "full": full}[depth]
+    return [TrialSettings("method"), *(TrialSettings("iterations", {"iterations": n}) for n in numbers)]
 
 
 def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
@@ -116,8 +122,8 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
     **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
     "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
     "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
-    "osem": partial(_iterations, (8, 20), (2, 8, 20, 40)),
-    "mlem": partial(_iterations, (20, 50), (10, 20, 50, 150)),
+    "osem": partial(_beside_chosen, (3, 12), (1, 3, 6, 12, 50)),
+    "mlem": partial(_beside_chosen, (12, 50), (4, 12, 24, 50, 200)),
     "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
     "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
     "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),

@@ -75,7 +75,7 @@ def test_recon_reads_it_and_gives_what_the_function_gives(pet: Path, tmp_path: P
         counted = source.emission(np.arange(24), slice(0, 3))
         geometry = recon.Geometry.parallel(source.angles, (3, 32), pixel_pitch=2.0)
     expected = recon.mlem(recon.Emission(counted.counts, geometry, counted.survival, counted.background),
-                          recon.Grid.matching(geometry), 3, 10)  # fmt: skip
+                          recon.Grid.matching(geometry), 3, 4)  # fmt: skip
     with h5py.File(out) as file:
         np.testing.assert_array_equal(file["entry/data/data"][()], expected.data)
         assert file["entry/data/data"].attrs["units"] == "counts/mm"

@@ -55,7 +55,7 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
         assert isinstance(method, BoundedMethod) == hasattr(method, "seconds")
         for length in {"steps", "iterations"} & {f.name for f in fields(method)}:  # type: ignore[arg-type]
             if method.traits.own_length:
-                assert getattr(method, length) < 1e3
+                assert (getattr(method, length) or 0) < 1e3  # None: the data choose it
                 continue
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
