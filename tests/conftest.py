@@ -79,6 +79,21 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             pytest.exit("a kernel cannot be compiled, or the simulated instrument cannot scan: see above", 1)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Of the whole suite, files without a test of the kind that is asked for are not imported, as most of the time of
+    collecting is imports: measurements, and, where slow tests are asked for, files that name none."""
+    if [Path(argument).name for argument in config.args] != ["tests"]:
+        return None
+    asked = config.option.markexpr
+    if "not bench" in asked and collection_path == Path(__file__).parent / "bench":
+        return True
+    if not asked.startswith("slow") or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
+
+
 def pytest_collection_finish() -> None:
     """What is loaded now lives to the end: the garbage collector need not look through it time and again."""
     gc.collect()
