@@ -74,9 +74,9 @@ class Air:
     model: str = option(
         "--air",
         "auto",
-        "Level the air of each view at zero. columns: take off the line through the air at both edges. "
-        "LEFT,RIGHT: from so many columns. surface:0 to 3: take off a polynomial through all rays that miss the "
-        "sample, too. auto: the surface where the views confirm it.",
+        "Set the air of each view to zero. columns: subtract the line through the air at both edges. LEFT,RIGHT: the "
+        "same, with this many columns of air at each edge. surface:0 to surface:3: also subtract a polynomial of this "
+        "order, fitted to all rays that miss the sample. auto: the surface, if the views confirm it.",
         parse=_model,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )

@@ -55,8 +55,8 @@ class Jumps:
     wanted: str = option(
         "--jumps",
         "correct",
-        "correct: where the monitor saw the sample jump, views are corrected by shifts and a turn, or left out. "
-        "ignore: they are used as they are.",
+        "correct: after the monitor saw the sample jump, correct the views for its shift and turn, or leave them out. "
+        "ignore: use them as they are.",
         choices=("correct", "ignore"),
     )
 
