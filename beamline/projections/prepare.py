@@ -15,7 +15,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.calibrate import Calibrate
-from beamline.projections.corrections.poses import poses_of, require_known, stated_poses
+from beamline.projections.corrections.poses import ScanPoses, poses_of, require_known, stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.emission import prepare_emission
 from beamline.projections.prepared import PreparedProjections
@@ -88,13 +88,7 @@ def prepare_projections(
         return prepare_emission(source, emission, selection, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable = checked_views(source, selection, warn)
-    pixel_size(source, selection)
-    first = choose_views(source, usable.frames, selection)  # what is wrong is told before any frame is read
-    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
-    poses = poses_of(source, selection, usable.frames)
-    if poses is not None:
-        require_known(poses, source, selection, usable.frames[first])
+    usable, poses = _usable(source, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
@@ -106,50 +100,90 @@ def prepare_projections(
     phases.enter("jumps", "guesses")
     view_geometry = ViewGeometry(source, selection, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
-    chosen = choose_views(source, usable.frames, selection, view_geometry.of(usable.frames).period)
-    wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
-    if poses is not None:
-        require_known(poses, source, selection, wanted)
-        rest = rest[poses.known(rest)]
-    others_ids = spread(rest, _HELD_OUT_VIEWS)
-    view_geometry.calibrate(np.union1d(wanted, others_ids), phases)
+    used, others = _chosen(view_geometry, usable, poses)
+    view_geometry.calibrate(np.union1d(used, others), phases)
     if check is not None:
-        check(view_geometry.of(wanted))
+        check(view_geometry.of(used))
     phases.enter("correction")
-    if buffer is None:
-        projections = correction.at_once(wanted, progress=phases.progress)
-    else:
-        projections = correction.in_batches(wanted, buffer.views, buffer.batch, buffer.progress)
-    if 2 * projections.view_ids.size < wanted.size:
-        raise DataError(
-            f"{source.path}: only {projections.view_ids.size} of {wanted.size} views can be used; the others have no "
-            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
-            "those that can be used with --views, or repeat the others."
-        )
+    projections = _corrected(source, correction, used, buffer, phases)
     phases.enter("background, rings, views held out, hardening", "corrections")
-    others = None
+    held_out = None
     with suppress(NoViewError):  # those held out may all be without light
-        others = correction.at_once(others_ids) if rest.size else None
-    ids = projections.view_ids
-    on_disk, column = buffer is not None, view_geometry.axis_col
-    found = assemble(source, selection, projections, view_geometry.of(ids), (column, axis), usable, warn, on_disk)
-    if others is not None:
-        found = replace(
-            found,
-            held_out=(others.data, view_geometry.of(others.view_ids)),
-            held_out_ids=others.view_ids,
-            held_out_weights=others.weights,
+        held_out = correction.at_once(others) if others.size else None
+    geometry, on_disk = view_geometry.of(projections.view_ids), buffer is not None
+    at = view_geometry.axis_col, axis
+    prepared = assemble(source, selection, projections, geometry, at, usable, warn, on_disk)
+    if held_out is not None:
+        prepared = replace(
+            prepared,
+            held_out=(held_out.data, view_geometry.of(held_out.view_ids)),
+            held_out_ids=held_out.view_ids,
+            held_out_weights=held_out.weights,
         )
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     done = {**correction.done, **tilt, **view_geometry.done}
-    found = replace(found, done=done)
-    steps = [step for step in in_order(selection) if isinstance(step, ScanStep)]
-    for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(found, source.angles[ids], phases.progress)
-        phases.progress(n, len(steps))
+    prepared = _after_scan_steps(source, selection, replace(prepared, done=done), phases)
     if on_disk:
-        _fill_unknown(found)
-    return found
+        _fill_unknown(prepared)
+    return prepared
+
+
+def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
+    """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
+    usable = checked_views(source, selection, warn)
+    pixel_size(source, selection)
+    first = choose_views(source, usable.frames, selection)
+    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
+    poses = poses_of(source, selection, usable.frames)
+    if poses is not None:
+        require_known(poses, source, selection, usable.frames[first])
+    return usable, poses
+
+
+def _chosen(
+    view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the file of the views that are used, and of some others that are held out."""
+    source, selection, frames = view_geometry.source, view_geometry.selection, usable.frames
+    chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
+    used, rest = frames[chosen], np.delete(frames, chosen)
+    if poses is not None:
+        require_known(poses, source, selection, used)
+        rest = rest[poses.known(rest)]
+    return used, spread(rest, _HELD_OUT_VIEWS)
+
+
+def _corrected(
+    source: ScanSource,
+    correction: ScanCorrection,
+    used: NDArray[np.int64],
+    buffer: DiskBuffer | None,
+    phases: Phases,
+) -> Projections:
+    """Line integrals of these rows of the file. DataError where fewer than half of them can be used."""
+    if buffer is None:
+        projections = correction.at_once(used, progress=phases.progress)
+    else:
+        projections = correction.in_batches(used, buffer.views, buffer.batch, buffer.progress)
+    if 2 * projections.view_ids.size < used.size:
+        raise DataError(
+            f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
+            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
+            "those that can be used with --views, or repeat the others."
+        )
+    return projections
+
+
+def _after_scan_steps(
+    source: ScanSource, selection: Selection, prepared: PreparedProjections, phases: Phases
+) -> PreparedProjections:
+    """The views after the steps on all of them, which change line integrals in place."""
+    done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
+    prepared = replace(prepared, done=done)  # a step sees what those before it did
+    for n, step in enumerate(steps, 1):
+        done[step.name] = step.apply(prepared, source.angles[prepared.projections.view_ids], phases.progress)
+        phases.progress(n, len(steps))
+    return prepared
 
 
 def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:

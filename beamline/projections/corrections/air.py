@@ -74,9 +74,9 @@ class Air:
     model: str = option(
         "--air",
         "auto",
-        "Level the air of each view at zero. columns: take off the line through the air at both edges. "
-        "LEFT,RIGHT: from so many columns. surface:0 to 3: take off a polynomial through all rays that miss the "
-        "sample, too. auto: the surface where the views confirm it.",
+        "Set the air of each view to zero. columns: subtract the line through the air at both edges. LEFT,RIGHT: the "
+        "same, with this many columns of air at each edge. surface:0 to surface:3: also subtract a polynomial of this "
+        "order, fitted to all rays that miss the sample. auto: the surface, if the views confirm it.",
         parse=_model,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )
@@ -181,14 +181,15 @@ def without_background(
     """
     from beamline.projections.truncation import cut_sides
     from recon.base.noise import noise_level
-    from recon.prep.background import LEAST_SIZE
 
     if wanted == "none":
         return "", None
     order = None if wanted == "auto" else wanted
     views = _Views(data, geometry, unknown)
-    known = _see_all_sides(geometry) and not cut_sides(data, geometry)  # a sample that fills the field looks like air
-    fitted, where = _fitted(views, order) if known else (None, None)
+    shows_air = _see_all_sides(geometry) and not cut_sides(
+        data, geometry
+    )  # a sample that fills the field looks like air
+    fitted, where = _fitted(views, order) if shows_air else (None, None)
     if fitted is None or where is None:
         if order is None:
             return "", None
@@ -197,13 +198,7 @@ def without_background(
         )
     if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
         return "", None
-    before = ""
-    if abs(levelled) >= LEAST_SIZE:
-        before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
-    seen = (
-        f"{before}the air of the views is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} of line "
-        f"integral, by the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
-    )
+    seen = _described(fitted, levelled)
     # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
     if order is None and fitted.may_be_matter and fitted.level + levelled > 0:
         return (
@@ -220,6 +215,19 @@ def without_background(
         f"Background of the beam: {seen}; taken off. Air was {fitted.before:.2g} off nothing and is {fitted.after:.2g}."
     )
     return said, fitted.coefficients.mean(axis=0)
+
+
+def _described(fitted: Background, levelled: float) -> str:
+    """The surface in words, and the line that was taken off before it."""
+    from recon.prep.background import LEAST_SIZE
+
+    before = ""
+    if abs(levelled) >= LEAST_SIZE:
+        before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
+    return (
+        f"{before}the air of the views is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} of line "
+        f"integral, by the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
+    )
 
 
 def _see_all_sides(geometry: Geometry) -> bool:

@@ -58,9 +58,9 @@ class Calibrate:
     terms: tuple[str, ...] = option(
         "--calibrate",
         "none",
-        "What is learnt from the views, a list of: axis, roll (its lean in the detector's plane), tilt (along the "
-        "beam), shifts (of each view), background (of the beam), gains (of pixels). Geometry is not resampled; what "
-        "views held out do not confirm stays as it was.",
+        "Learn these from the views, separated by commas: axis, roll (lean of the axis in the detector's plane), tilt "
+        "(lean along the beam), shifts (of each view), background (of the beam), gains (of pixels). Views are not "
+        "resampled. What held-out views do not confirm is not changed.",
         parse=_terms,
         metavar="LIST",
     )

@@ -40,13 +40,17 @@ class CountModel:
     noise: Noise = option(
         "--noise",
         "auto",
-        "log: line integrals are logarithms of counts. counts: line integrals and weights carry the likelihood "
-        "of the photons counted, for few photons. auto: counts where a pixel of the open beam has fewer than "
+        "log: line integrals are logarithms of counts. counts: for few photons, line integrals and weights that "
+        "represent the likelihood of the counted photons. auto: counts if a pixel of the open beam has fewer than "
         f"{FEW_PHOTONS}.",
         choices=get_args(Noise),
     )
     gain: float | None = option(
-        "--gain", None, "Counts a photon, for --noise. Default: as the flats vary.", parse=positive, metavar="COUNTS"
+        "--gain",
+        None,
+        "Counts per photon, for --noise. Default: from the variance of the flats.",
+        parse=positive,
+        metavar="COUNTS",
     )
 
     def __post_init__(self) -> None:

@@ -43,9 +43,9 @@ class Flags:
     wanted: str = option(
         "--flags",
         "use",
-        "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, "
-        "correct views after a jump of the sample. judge: let the monitor look at the frames first. ignore: take "
-        "all views alike.",
+        "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, and "
+        "correct views after a jump of the sample. judge: run the monitor on the frames first and use its flags. "
+        "ignore: use all views alike.",
         choices=("use", "judge", "ignore"),
     )
 

@@ -61,8 +61,9 @@ class Hardening:
     wanted: str | None = option(
         "--hardening",
         "none",
-        "Beam hardening of a sample of one material. fit: by its own views; BEAM: 60kV (a tube), 60kV,Al=1,Cu=0.1 "
-        "(behind mm of filters), or a text file of lines: keV weight.",
+        "Correct beam hardening of a sample of one material. fit: by a curve fitted to its views. MATERIAL:BEAM: by "
+        "attenuation, where BEAM is a tube (60kV), a tube behind mm of filters (60kV,Al=1,Cu=0.1), or a text file with "
+        "a line 'keV weight' for each energy.",
         parse=_wanted,
         metavar="none|fit|MATERIAL:BEAM",
     )

@@ -55,8 +55,8 @@ class Jumps:
     wanted: str = option(
         "--jumps",
         "correct",
-        "correct: where the monitor saw the sample jump, views are corrected by shifts and a turn, or left out. "
-        "ignore: they are used as they are.",
+        "correct: after the monitor saw the sample jump, correct the views for its shift and turn, or leave them out. "
+        "ignore: use them as they are.",
         choices=("correct", "ignore"),
     )
 
@@ -77,11 +77,11 @@ class Jumps:
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         said = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return SampleMotion(usable.frames, said=said if usable.jumps.size else "")
+        return SampleJumps(usable.frames, said=said if usable.jumps.size else "")
 
 
 @dataclass(frozen=True, eq=False)
-class SampleMotion:
+class SampleJumps:
     """Where the sample was in the views of a scan in which it jumped.
 
     Attributes:
@@ -117,7 +117,7 @@ def find_jumps(
     jumps: I64,
     axis_col: float,
     progress: Callable[[int, int], None] = lambda n, most: None,
-) -> SampleMotion:
+) -> SampleJumps:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
@@ -133,10 +133,10 @@ def find_jumps(
 
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
-        return SampleMotion(frames)
+        return SampleJumps(frames)
     if cone_of(source, selection) is not None:
         where = frames_text(jumps)
-        return SampleMotion(
+        return SampleJumps(
             frames,
             said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
             "it had not moved. Choose those of one side with --views.",
@@ -327,7 +327,7 @@ def _done(
     moves: Sequence[Displacement],
     verdict: Judgement | None = None,
     unlike: bool = False,
-) -> SampleMotion:
+) -> SampleJumps:
     """The views that are used, where the sample is in them, and what was done in a line.
 
     Args:
@@ -365,4 +365,4 @@ def _done(
             f"After the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
             f"{LARGEST:g} px): views on both sides are used as they are."
         )
-    return SampleMotion(frames, fit.jumps, part_moves, " ".join(text))
+    return SampleJumps(frames, fit.jumps, part_moves, " ".join(text))

@@ -54,25 +54,25 @@ class Phase:
     material: str | None = option(
         "--phase",
         "none",
-        "Phase retrieval from one distance (Paganin); X is delta/beta, or a material: a chemical formula or a "
-        "name that scenes know.",
+        "Phase retrieval from one distance (Paganin). X is the ratio delta/beta, or a material: a chemical formula, or "
+        "a name that scenes use.",
         parse=_material,
         metavar="none|paganin:X",
     )
     distance_mm: float | None = option(
         "--distance-mm",
         None,
-        "For --phase: from the sample to the detector. Default: as in the file.",
+        "For --phase: distance from the sample to the detector. Default: from the file.",
         parse=positive,
         metavar="MM",
     )
     energy_kev: float | None = option(
-        "--energy-kev", None, "For --phase. Default: as in the file.", parse=positive, metavar="KEV"
+        "--energy-kev", None, "For --phase: photon energy. Default: from the file.", parse=positive, metavar="KEV"
     )
     unsharp: tuple[float, float] | None = option(
         "--unsharp",
         None,
-        "For --phase: unsharp mask after it, which gives fine detail back; SIGMA in pixels.",
+        "For --phase: unsharp mask afterwards, which restores fine detail; SIGMA in pixels.",
         parse=_unsharp,
         metavar="SIGMA:WEIGHT",
     )

@@ -50,9 +50,10 @@ class PosesOfFile:
     table: PoseTable | None = option(
         "--poses",
         None,
-        "Displacement, roll and tilt of each view; no view is resampled. A CSV with view or angle_deg, and "
-        "shift_col_px, shift_row_px, roll_deg, tilt_deg. Or a volume that keeps poses. Or an NXtomo file as FILE:x,-y: "
-        "columns grow with x_translation, rows against y_translation. ignore: without the shifts that a .txrm states.",
+        "Displacement, roll and tilt of each view; no view is resampled. FILE is a CSV with the columns view or "
+        "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an NXtomo file "
+        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. ignore: do not use the shifts that "
+        "a .txrm states.",
         parse=_table,
         metavar="FILE",
     )

@@ -41,8 +41,8 @@ class ReferenceCheck:
     wanted: str = option(
         "--references",
         "check",
-        "check: leave out groups of darks and flats that are saturated, dark, uneven or lit; refuse the scan if "
-        "no group is left. accept: use all as they are.",
+        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven or lit); refuse the scan if "
+        "no group remains. accept: use all as they are.",
         choices=("check", "accept"),
     )
 
@@ -70,14 +70,14 @@ class Flats:
     fields: FlatFields = option(
         "--flat-fields",
         "groups",
-        "groups: interpolate the flat of a view between the means of groups of flats. dynamic: add the changes "
-        "of the flats that the view shows, for a beam that moves (4 flats or more).",
+        "groups: interpolate the flat of each view between the means of the groups of flats. dynamic: for a beam that "
+        "moves, also add those variations of the flats that the view shows (needs 4 flats or more).",
         choices=get_args(FlatFields),
     )
     ring_current: str = option(
         "--ring-current",
         "ignore",
-        "use: views and flats are divided by the current of each frame in the file (control/data of NXtomo).",
+        "use: divide views and flats by the ring current of each frame in the file (control/data of NXtomo).",
         choices=("ignore", "use"),
     )
 

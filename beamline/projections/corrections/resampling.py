@@ -73,16 +73,16 @@ class TiltAndLens:
     tilt: float | str | None = option(
         "--tilt",
         None,
-        "By how much the rotation axis leans in the detector's plane (its column grows with the rows): views are "
-        "turned. auto finds it by all rows. Default: views are used as they are, with a warning if they show a tilt.",
+        "Lean of the rotation axis in the detector's plane, positive if its column grows with the rows; views are "
+        "turned by it. auto: find it by all rows. Default: use views as they are, with a warning if they show a tilt.",
         parse=_tilt,
         metavar="DEGREES|auto",
     )
     distortion: resample.Distortion | None = option(
         "--distortion",
         None,
-        "Radial distortion of the lens, which is taken out of the views: the text file that discorpy writes "
-        "(backward model: xcenter, ycenter, factor0 ...).",
+        "Correct the radial distortion of the lens by FILE, the text file that discorpy writes (backward model: "
+        "xcenter, ycenter, factor0 ...).",
         parse=_distortion,
         metavar="FILE",
         path=True,

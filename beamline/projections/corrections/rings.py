@@ -30,8 +30,9 @@ class Rings:
     way: Way = option(
         "--rings",
         "none",
-        "Stripes of the sinograms, which make rings. sort: small ones; vo: dead columns, large and small ones; "
-        "wavelet: by their wavelets; auto: what it sees. Layers of the sample around the axis stay.",
+        "Remove stripes of the sinograms, which make rings. sort: small stripes. vo: dead columns, large and small "
+        "stripes. wavelet: by their wavelet coefficients. auto: the kinds that it detects. Layers of the sample around "
+        "the axis are kept.",
         choices=get_args(Way),
     )
 

@@ -74,16 +74,16 @@ class Width:
     spread: str = option(
         "--ray-width",
         "none",
-        "none: a pixel sees one ray. pixel: its own area. SIGMA: that, and a Gaussian blur of SIGMA pixels.",
+        "What a pixel sees. none: one ray. pixel: its own area. SIGMA: its area with a Gaussian blur of SIGMA pixels.",
         parse=_spread,
         metavar="none|pixel|SIGMA",
     )
     arc: str = option(
         "--exposure-arc",
         "auto",
-        "Degrees that the stage turns: ARC during an exposure, READOUT from the first row's readout to the last's "
-        "(below 0: the last row is read first). auto: as the file of a fly scan says, where ARC is 1 px or more. none: "
-        "it stands.",
+        "Degrees that the stage turns: ARC during an exposure, READOUT from the readout of the first row to that of "
+        "the last (negative: the last row is read first). auto: from the file of a fly scan, if ARC is 1 px or more at "
+        "the edge of the field. none: the stage stands still.",
         parse=_arc,
         metavar="auto|none|ARC[:READOUT]",
     )

@@ -16,7 +16,7 @@ from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
@@ -129,9 +129,9 @@ def test_sets_of_another_shape_and_a_wrong_scene_are_refused(pet: Path, tmp_path
 
 
 def test_counts_are_not_spilled(pet: Path) -> None:
-    spill = Spill(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
+    buffer = DiskBuffer(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
     with open_scan(pet) as source, pytest.raises(DataError, match="have to be in memory"):
-        prepare_projections(source, Selection(), print, spill)
+        prepare_projections(source, Selection(), print, buffer)
 
 
 @pytest.mark.usefixtures("one_thread")
