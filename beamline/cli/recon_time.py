@@ -67,7 +67,7 @@ def recon_series(options: ReconOptions, volumes: int, moves: bool | None, dry: b
             found = reconstruct_series(
                 options, wanted, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)
             )
-        said: Any = needs if found is None else found
+        said: Any = needs if found is None else found.told()
         sink(Done(said, time=clock.now()))
     if not as_json:
         click.echo("\n".join(needs.lines() if found is None else found.lines()))
