@@ -451,10 +451,10 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended well."""
+    """A run has ended well. result: a `RunResult`; of a line of another process, its values by name."""
 
     folder: Path
-    result: RunResult = _spread(RunResult.of_run)
+    result: Any = _spread(RunResult.of_run)
 
 
 class Done(Listed, event="done"):
