@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from types import UnionType
@@ -16,6 +17,7 @@ from typing import Any, BinaryIO, ClassVar, Union, dataclass_transform, get_args
 
 import numpy as np
 
+from beamline.core.flag import Flag
 from beamline.core.process import json_object
 from beamline.core.run_result import RunResult
 
@@ -150,6 +152,9 @@ def _fits(value: Any, kind: Any) -> bool:
         return any(_fits(value, each) for each in get_args(kind))
     if origin is collections.abc.Mapping:
         return isinstance(value, dict) and all(_fits(each, get_args(kind)[1]) for each in value.values())
+    if origin is tuple:
+        of = get_args(kind)
+        return isinstance(value, list) and len(value) == len(of) and all(map(_fits, value, of))
     if origin is collections.abc.Sequence:
         return isinstance(value, list) and all(_fits(each, get_args(kind)[0]) for each in value)
     if kind is float and value is not None:
@@ -158,7 +163,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return True
     if kind is int:
         return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
-    return kind is Any or isinstance(value, str if kind is Path else kind)
+    return kind is Any or isinstance(value, str if issubclass(kind, Path | StrEnum) else kind)
 
 
 def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
@@ -265,17 +270,9 @@ class BeamRead(Event, event="beam"):
 
 
 class FrameFlagged(Event, event="flag"):
-    """A check of the monitor begins to flag, or flags at another level; the fields are those of `monitor.Flag`."""
+    """A check of the monitor begins to flag, or flags at another level."""
 
-    check: str
-    level: str
-    frame: int
-    score: float
-    limit: float
-    advice: str
-    region: Sequence[int] | None
-    first: int | None
-    from_region: Sequence[int] | None = None
+    flag: Flag = _spread(Flag.told)
 
 
 class RuleBroken(Event, event="flag"):
@@ -454,10 +451,10 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended well."""
+    """A run has ended well. result: a `RunResult`; of a line of another process, its values by name."""
 
     folder: Path
-    result: RunResult = _spread(RunResult.of_run)
+    result: Any = _spread(RunResult.of_run)
 
 
 class Done(Listed, event="done"):
@@ -467,7 +464,7 @@ class Done(Listed, event="done"):
 class VolumeDone(Event, event="done"):
     """A reconstruction of this process has ended well; that of another process is read as `Done`.
 
-    record: of the volume, a `beamline.storage.writers.recon_file.ReconRecord`.
+    record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """
 
     record: Any = _spread(lambda record: record.told())

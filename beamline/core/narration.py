@@ -41,8 +41,8 @@ def sentence(event: Event) -> str | None:
             return f"{n} {kind} frames ({mode}, {exposure:g} s each)"
         case BlockDone():
             return _missing(event)
-        case FrameFlagged(check, level, frame, advice=advice):
-            return f"{level.capitalize()} ({check}, frame {frame}): {advice}"
+        case FrameFlagged(flag):
+            return f"{flag.level.capitalize()} ({flag.check}, frame {flag.frame}): {flag.advice}"
         case ReconStarted():
             again = " again, from the start" if event.again else ""
             return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"

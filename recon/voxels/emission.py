@@ -231,6 +231,7 @@ def passes_by_halves(
         background=None if emission.background is None else emission.background * np.float32(0.5),
     )
     survival, other = half.survival, counts - kept
+    assert survival is not None
     if half.background is not None:
         other -= half.background
     lines = np.divide(other, survival, out=np.zeros_like(other), where=survival > 0)
