@@ -143,13 +143,46 @@ _COMMANDS = {
 }
 
 
-_WITH_TORCH = "demo recon materials batch tradeoff study bench voxelise render"
-_WITH_ARRAYS = "tune align scan simulate xafs view segment info validate archive monitor ingest export surface"
-_ADDRESSES = {
-    **dict.fromkeys(_WITH_TORCH.split(), 1_300_000_000),
-    **dict.fromkeys(_WITH_ARRAYS.split(), 600_000_000),
-}
-"""Bytes of addresses that the libraries of a command take at least, on Linux with two cores."""
+@dataclass(frozen=True)
+class _Libraries:
+    """What the libraries of some commands need, under a limit of addresses.
+
+    Attributes:
+        addresses: bytes that a command on a tiny scan takes at its peak, with one thread of BLAS, and a twentieth more;
+            measured on Linux with two cores.
+        early: modules that are otherwise loaded late, when data have taken the room.
+    """
+
+    commands: str
+    addresses: int
+    early: tuple[str, ...]
+
+
+_LIBRARIES = (
+    _Libraries(
+        "demo recon materials batch tradeoff study bench voxelise render",
+        1_850_000_000,
+        ("scipy.linalg", "torch", "matplotlib.figure"),
+    ),
+    _Libraries("monitor scan tune align simulate", 1_350_000_000, ("scipy.linalg", "scipy.ndimage")),
+    _Libraries("xafs view segment info validate archive ingest export surface", 800_000_000, ("scipy.linalg",)),
+)
+
+
+def _load_early(modules: tuple[str, ...]) -> None:
+    """Load these libraries, and the compiler of kernels, before data take the room.
+
+    OpenBLAS waits for ever where it gets no memory while it is loaded, and LLVM ends the process.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # each thread takes 40 MB of addresses
+    for module in modules:
+        import_module(module)
+    numba: Any = import_module("numba")
+    numba.njit(_nothing)()
+
+
+def _nothing() -> None:
+    pass
 
 
 class LazyGroup(click.Group):
@@ -171,12 +204,15 @@ class LazyGroup(click.Group):
         """As click does. DataError where a limit leaves no room for the libraries: some end the process then."""
         from beamline.core.machine import memory_limit  # here, so that the help loads without it
 
-        needs = _ADDRESSES.get(args[0], 0) if args else 0
-        if needs and (limit := memory_limit()) is not None and limit < needs:
-            raise DataError(
-                f"Out of memory: this process may use {size(limit)} of address space (ulimit -v), and the libraries of "
-                f"`beamline {args[0]}` alone need {size(needs)}. Nothing was read or written."
-            )
+        libraries = next((each for each in _LIBRARIES if args and args[0] in each.commands.split()), None)
+        if libraries is not None and (limit := memory_limit()) is not None:
+            if limit < libraries.addresses:
+                raise DataError(
+                    f"Out of memory: this process may use {size(limit)} of address space (ulimit -v), and the "
+                    f"libraries of `beamline {args[0]}` alone need {size(libraries.addresses)}. Nothing was read or "
+                    "written."
+                )
+            _load_early(libraries.early)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -244,6 +280,7 @@ def run() -> NoReturn:
         code = end.code if isinstance(end.code, int) else BeamlineError.exit_code if end.code else 0
     except KeyboardInterrupt:  # outside the work of a command, as while its result is printed
         code = INTERRUPTED
+    exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
     if lost := outputs.lost():
         click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
         entry = _COMMANDS.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))

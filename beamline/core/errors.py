@@ -91,11 +91,13 @@ def memory_limit_said() -> str:
 
 
 _NO_MEMORY = re.compile(
-    "failed to map segment(?!.*not permitted)|can't start new thread|bad_alloc|memory allocation (of|failed)|"
+    "failed to map segment(?!.*not permitted)|can't start new thread|bad_alloc|Resource temporarily unavailable|"
+    "memory allocation (of|failed)|"
     "out of memory|not enough memory|(can't|cannot|could not|failed to|unable to) allocate(?!.*static TLS)",
     re.IGNORECASE,
 )
-"""Sentences of the loader of libraries, Python's threads, C++, Rust, HDF5, torch (also CUDA), LLVM and numpy."""
+"""Sentences of the loader of libraries, Python's threads, C++ and its threads, Rust, HDF5, torch (also CUDA), LLVM and
+numpy."""
 
 
 def out_of_memory(error: BaseException | None) -> bool:

@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from beamline.cli import main as module
 from beamline.cli import man
 from beamline.core import errors
-from beamline.core.errors import leave_traceback, user_message
+from beamline.core.errors import INTERRUPTED, leave_traceback, user_message
 from drivers.base.errors import DeviceError, DeviceTimeout
 
 
@@ -229,3 +229,9 @@ def test_text_of_a_manual_page_is_never_a_request() -> None:
 
 def test_a_manual_page_of_no_command_is_refused() -> None:
     assert CliRunner().invoke(module.main, ["man", "nothing"]).exit_code == 2
+
+
+def test_an_interruption_that_went_through_a_text_of_code_has_its_exit_code_too() -> None:
+    """Python would end by the signal: dataclasses, which modules make while they load, run such texts."""
+    code = "import beamline.cli.main as m; m.main = lambda **_: exec('raise KeyboardInterrupt'); m.run()"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == INTERRUPTED

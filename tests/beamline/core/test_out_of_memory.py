@@ -113,6 +113,7 @@ def _raised_after(cause: BaseException, error: BaseException) -> BaseException:
         (RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory: 9 bytes"), True),
         (RuntimeError("CUDA out of memory. Tried to allocate 2.00 GiB"), True),
         (RuntimeError("std::bad_alloc"), True),
+        (RuntimeError("Resource temporarily unavailable"), True),
         (RuntimeError("no memory of it"), False),
         (ValueError("out of memory"), False),
         (_raised_after(KeyError("a"), RuntimeError("wrong")), False),
