@@ -257,18 +257,16 @@ def recon(
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
-    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
-    from beamline.reconstruct.finished import reconstruct_file
-    from beamline.reconstruct.follow import follow as follow_scan
-    from beamline.reconstruct.options import ReconOptions
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
-    from recon.voxels.enough_views import Goal
+    from beamline.reconstruct.output_paths import OutputPaths, report_beside  # here: help needs none of it
 
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
     if volumes is not None:
         refuse_others(context, values)
         refuse_shared({"FILE": file, "--output": output})
+        _require_there(file, as_json)
+        from beamline.reconstruct.options import ReconOptions
+
         source, selection = chosen(file, seed, values)
         target = output or Path(f"{file.stem}_time.h5")
         for_series = ReconOptions(
@@ -286,7 +284,7 @@ def recon(
     for step in steps_said(values) if follow else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
-    enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
+    has_goal = (enough_loss, enough_gain) != (None, None)
     partial = resume if resumes_slabs(resume) else None
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
@@ -295,7 +293,7 @@ def recon(
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     whole, tries = follow or budget is not None, tried is not None
     for refused, why in (
-        (enough and not follow, "--enough-loss and --enough-gain are for a scan that still runs: give --follow."),
+        (has_goal and not follow, "--enough-loss and --enough-gain are for a scan that still runs: give --follow."),
         (memory and whole, "--memory does not go with --follow or --budget, which hold everything in memory."),
         (partial and follow, f"--resume {resume} holds slabs of a finished scan; it does not go with --follow."),
         (dry and whole, "--dry-run does not go with --follow or --budget, which says the time itself."),
@@ -315,6 +313,14 @@ def recon(
     if typed is not None and (typed.suffix.lower() == _SHEET) != tries:
         what, suffix = ("--axis try writes a picture", _SHEET) if tries else ("only --axis try writes a picture", ".h5")
         raise click.UsageError(f"-o {typed}: {what}; give a name such as {typed.with_suffix(suffix)}.")
+    if not follow:
+        _require_there(file, as_json)
+    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: refusals above need none of it
+    from beamline.reconstruct.finished import reconstruct_file
+    from beamline.reconstruct.follow import follow as follow_scan
+    from beamline.reconstruct.options import ReconOptions
+    from recon.voxels.enough_views import Goal
+
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
@@ -329,7 +335,7 @@ def recon(
         seed=seed,
         truth=truth,
         unfinished=unfinished,
-        enough=enough,
+        enough=Goal(enough_gain, enough_loss) if has_goal else None,
         memory=memory,
         region=roi,
         cluster=cluster,
@@ -378,6 +384,13 @@ def recon(
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:
         require(metrics, max_residual)
+
+
+def _require_there(file: Path, as_json: bool) -> None:
+    """Raises DataError at once where there is no scan, before the libraries that compute are loaded."""
+    if not file.exists():
+        with json_events(as_json):
+            raise DataError(f"{file} is not there.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
