@@ -23,6 +23,7 @@ from beamline.cli.options import (
     json_events,
     refuse_contradictions,
     refuse_shared,
+    require_there,
 )
 from beamline.cli.recipe import given, recipe_text, repeating
 from beamline.cli.recon_options import SHEET, recon_options
@@ -79,6 +80,8 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
         what, suffix = ("only --axis try", ".h5") if axes is None else ("--axis try", SHEET)
         example = path.with_suffix(suffix)
         raise click.UsageError(f"-o {output}: {what} writes a picture; give a name such as {example}.")
+    if not values["follow"] and values["write_config"] is None:
+        require_there(file, values["as_json"])
     options = _options(context, file, method, path, values | {"axis": None if axes is not None else values["axis"]})
     if values["write_config"] is not None:
         if output is not None:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from beamline.cli.option_groups import METHOD, heading
-from beamline.cli.options import Declared, name_of, option, refuse_shared, together
+from beamline.cli.options import Declared, name_of, option, refuse_shared, require_there, together
 from beamline.cli.recipe import given, repeating
 from beamline.cli.selection_options import chosen
 from beamline.cli.terminal import counting, events_shown
@@ -53,6 +53,7 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
     if not isinstance(values["axis"], float | None):
         raise click.UsageError("Find the axis first: give --axis try without --time, then its column with --time.")
     refuse_shared({"FILE": file, "--output": output})
+    require_there(file, values["as_json"])
     # Imported here: help needs none of it.
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside

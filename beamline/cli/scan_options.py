@@ -69,10 +69,10 @@ light_options = together(
 
 def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:
     """None if nobody asked for the light. Raises UsageError for a dose without photons."""
-    from beamline.projections.scan_statistics import LightAsked  # here: help does not need it
-
     if photons_per_count is None:
         if dose_in is not None:
             raise click.UsageError("--dose-in goes with --photons-per-count.")
         return None
+    from beamline.projections.scan_statistics import LightAsked  # here: it loads matplotlib and numba
+
     return LightAsked(photons_per_count, dose_in)
