@@ -76,7 +76,7 @@ def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
     assert child.process.wait(seconds=0.5, grace=100.0) is Ending.OUT_OF_TIME
-    assert 0.5 <= time.monotonic() - begin < 5.0
+    assert 0.5 <= time.monotonic() - begin < 30.0
     assert not child.process.running
 
 
@@ -92,7 +92,7 @@ def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
 def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hurry: bool) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
     assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is Ending.STOPPED
-    assert time.monotonic() - begin < 10.0
+    assert time.monotonic() - begin < 30.0
     assert child.process.code != 0
 
 

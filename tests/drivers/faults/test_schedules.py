@@ -70,7 +70,7 @@ def scheduled(rig_of: RigOf, runs: Path, seed: int) -> State | None:
     assert rig.world.live == 0, f"{seed}: the camera's library is still open"
     late = set(threading.enumerate()) - threads
     for thread in late:
-        thread.join(5)
+        thread.join(60)
     assert not any(thread.is_alive() for thread in late), seed
     if scanned.folder is None:
         assert error is not None and not rig.moving and not rig.shutter_open, (seed, error)

@@ -80,12 +80,12 @@ def test_closing_waits_for_the_request_of_another_thread() -> None:
     answers: list[str] = []
     asking = threading.Thread(target=lambda: answers.append(line.query("N?", "1", "one")[0]))
     asking.start()
-    assert wire.asked.wait(5.0)
+    assert wire.asked.wait(60.0)
     closing = threading.Thread(target=line.close)
     closing.start()
     wire.ready.set()
-    asking.join(5.0)
-    closing.join(5.0)
+    asking.join(60.0)
+    closing.join(60.0)
     assert answers == ["1"]
     assert not closing.is_alive()
     with pytest.raises(DeviceError, match="it was closed"):

@@ -174,7 +174,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
         for frame in frames:
             begun.clear()
             writer.append(frame, digest(frame.counts))
-            assert begun.wait(5.0)
+            assert begun.wait(60.0)
     assert [rows for _, rows in calls[:14]] == list(range(1, 15))
     assert (handle, 14) in calls[14:]  # before the file is closed; then come the /exchange view and its journal
 
