@@ -68,7 +68,7 @@ from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
 from beamline.reconstruct.outcome import label_of
 from beamline.trials.figures import pareto_plot
-from beamline.trials.trial import plan
+from beamline.trials.plans import plan
 from recon import methods
 
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))

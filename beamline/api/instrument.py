@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,6 +15,7 @@ from beamline.config.monochromator import NoMonochromator
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
+from beamline.core.run_result import RunResult
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from beamline.core.text import printable
@@ -35,47 +36,7 @@ def to_stderr(text: str) -> None:
         sys.stderr.flush()
 
 
-@dataclass(frozen=True)
-class ScanResult:
-    """The result of a scan.
-
-    Attributes:
-        path: the scan file; its folder holds everything else of the run.
-        sample: its name.
-        frames: in the file.
-        missing: planned rows without a frame.
-        flags: frames that the monitor flagged: their number by check, then by level.
-        alarms: frames with an alarm, without repeated ones.
-        retaken: views that were repeated, because they had an alarm or gave no frame.
-        reference_faults: faults of darks and flats, a text for each group.
-        status: `complete`, `stopped` or `failed`.
-        seconds: real time of the scan.
-        bytes: of the file.
-        volume: file of the reconstruction; None without one, or if it failed.
-    """
-
-    path: Path
-    sample: str
-    frames: int
-    missing: tuple[int, ...]
-    flags: Mapping[str, Mapping[str, int]]
-    alarms: int
-    retaken: int
-    reference_faults: tuple[str, ...]
-    status: str
-    seconds: float
-    bytes: int
-    volume: Path | None
-
-    @property
-    def folder(self) -> Path:
-        """Of the run."""
-        return self.path.parent
-
-    @property
-    def clean(self) -> bool:
-        """Whether the scan is complete, without a fault of frames, darks or flats."""
-        return self.status == "complete" and not (self.missing or self.alarms or self.reference_faults)
+ScanResult = RunResult  # what scripts get
 
 
 class Instrument:
@@ -188,7 +149,7 @@ class Instrument:
             if not stop.enough:
                 raise
         finally:
-            self.last = _result(config, said)
+            self.last = _result(said)
         assert self.last is not None
         return self.last
 
@@ -234,23 +195,8 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
     return {**used, "devices": {**used["devices"], "camera": camera}, "pitch": pitch}
 
 
-def _result(config: Config, said: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
+def _result(events: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
     """The result of a scan by its events; None where it ended before its file was made."""
-    done = next((event for event in said if isinstance(event, ScanDone)), None)
-    if done is None:
-        return None
-    volume = next((event.data["output"] for event in said if isinstance(event, ReconDone)), None)
-    return ScanResult(
-        path=done.path,
-        sample=config.sample.name,
-        frames=done.n_frames,
-        missing=tuple(done.missing),
-        flags=done.flags,
-        alarms=done.alarmed_frames,
-        retaken=done.retaken,
-        reference_faults=tuple(done.reference_faults),
-        status=done.status,
-        seconds=done.seconds,
-        bytes=done.bytes,
-        volume=None if volume is None else Path(volume),
-    )
+    scan = next((event for event in events if isinstance(event, ScanDone)), None)
+    recon = next((event for event in events if isinstance(event, ReconDone)), None)
+    return None if scan is None else replace(scan.result, recon=None if recon is None else recon.values)

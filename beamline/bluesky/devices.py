@@ -22,10 +22,11 @@ from beamline.bluesky.documents import STREAM, ScanStream
 from beamline.config.load import Config, resolved_yaml
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, RunStarted, Sink
+from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.scan.control import Verb, ask, state_of
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from drivers.base.protocols import RotationStage
 
 POLL = 0.2

@@ -95,7 +95,7 @@ class ScanStream:
         elif isinstance(event, FrameStored):
             self.rows = max(self.rows, event.n - self._behind)  # the writer flushes at least so often
         elif isinstance(event, ScanDone):
-            self.rows = event.n_frames
+            self.rows = event.result.n_frames
 
     def assets(self, until: int, run_start: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
         """Resources and datums of the rows that were not told yet, before the row `until`. `run_start`: uid of the
@@ -148,7 +148,7 @@ class Documents:
         if isinstance(event, FrameStored | ScanDone):
             self._tell_rows()
         if isinstance(event, ScanDone):
-            self._exit = {"complete": "success", "stopped": "abort"}.get(event.status, "fail")
+            self._exit = {"complete": "success", "stopped": "abort"}.get(event.result.status, "fail")
         elif isinstance(event, RunDone | Failed):
             self._end(event.message if isinstance(event, Failed) else "", failed=isinstance(event, Failed))
 

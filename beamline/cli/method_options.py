@@ -15,7 +15,7 @@ from beamline.cli.options import POSITIVE, Owner, declared, name_of, option, par
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
-from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
+from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, MODEL_STEPS, Loss, Start
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
 from recon.methods import DEFAULT, build, by_name, has_setting, names, taking, with_trait
@@ -173,7 +173,7 @@ _STEPS = option(
     excludes={"seconds": "give one of them", **_PLANNED},
     type=click.IntRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-    f"{SHORT_STEPS} where the noise of the views hides what more would gain and a finish follows.",
+    f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
 )
 _GAUSSIANS = option(
     "--gaussians",

@@ -96,7 +96,7 @@ def monitor(
                 now = {(flag.check, flag.level) for flag in judged.flags}
                 for flag in judged.flags:
                     if (flag.check, flag.level) not in active:
-                        sink(FrameFlagged(**vars(flag), time=clock.now()))
+                        sink(FrameFlagged(flag, time=clock.now()))
                 active = now
             summed = verdict(source, frames, limits)
             returned = [] if stopped() else returned_views(source)

@@ -74,7 +74,7 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
                 options, wanted, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)
             )
         outcome: Any = needs if series is None else series
-        sink(Done(outcome, time=clock.now()))
+        sink(Done(needs if series is None else series.told(), time=clock.now()))
     if not values["as_json"]:
         click.echo("\n".join(outcome.lines()))
     if series is not None and series.ended_early:

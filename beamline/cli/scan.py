@@ -23,8 +23,8 @@ from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
+    from beamline.core.run_result import RunResult
     from beamline.scan.resume import ResumableRun
-    from beamline.scan.run import RunResult
 
 
 @click.command()

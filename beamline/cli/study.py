@@ -97,9 +97,9 @@ def study(
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.trials.opened import ComparedScan
-    from beamline.trials.study import StudyOptions, run_study
-    from beamline.trials.study_table import text
+    from beamline.trials.layout import text
+    from beamline.trials.runner import ComparedScan
+    from beamline.trials.study import StudyLayout, StudyOptions, run_study
 
     methods = tuple(dict.fromkeys(methods))
     lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
@@ -122,8 +122,8 @@ def study(
     with events_shown(as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not as_json:
-        click.echo(text(table))
+        click.echo(text(table, StudyLayout(STUDIES[which])))
         click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
-        rows = sum(cell.row.groups is not None for cell in table.cells)
-        raise ScanStopped(f"The study was stopped after {len(table.done)} of {rows} rows; {folder} holds those.")
+        counts = f"{table.n_done} of {len(table.todo)}"
+        raise ScanStopped(f"The study was stopped after {counts} rows; {folder} holds those.")

@@ -8,7 +8,8 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from types import UnionType
@@ -16,15 +17,21 @@ from typing import Any, BinaryIO, ClassVar, Union, dataclass_transform, get_args
 
 import numpy as np
 
+from beamline.core.flag import Flag
 from beamline.core.process import json_object
+from beamline.core.run_result import RunResult
 
 KINDS: dict[str, list[type[Event]]] = {}
 """The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
-_SPREAD = {"spread": True}
-"""Of a field whose own values stand in the line: a mapping, a dataclass, or what says by `told` what it shows."""
+_SPREAD = "spread"
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def _spread(of: Callable[[Any], Mapping[str, Any]] | None = None) -> Any:
+    """A field whose own values stand in the line: a mapping, a dataclass, or what `of` makes of another value."""
+    return field(metadata={_SPREAD: of or _values_of})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field, _spread))
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """Something that happened; each kind is a frozen dataclass. A field that has its default is not written.
@@ -54,8 +61,8 @@ class Event:
         own = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
         for each in (*own, *(each for each in fields(Event) if each.name != "time")):
             value = getattr(self, each.name)
-            if each.metadata == _SPREAD:
-                found |= _spread(value)
+            if _SPREAD in each.metadata:
+                found |= value if isinstance(value, Mapping) else each.metadata[_SPREAD](value)
             elif value is not each.default:
                 found[each.name] = value
         return found
@@ -72,13 +79,17 @@ def event_of(values: Mapping[str, Any]) -> Event:
     """The event of a JSON line of another process. ValueError: no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
-        spread = [item.name for item in fields(each) if item.metadata == _SPREAD]
+        spread: dict[str, Any] = {
+            item.name: kind if is_dataclass(kind) else dict for item, kind in _spread_fields(each)
+        }
         named = {item.name: item for item in fields(each) if item.name not in spread}
         rest = {name: value for name, value in given.items() if name not in named}
         needed = {name for name, item in named.items() if item.default is MISSING}
         if needed <= given.keys() and (spread or not rest):
             taken: dict[str, Any] = {name: value for name, value in given.items() if name in named}
-            return each(**taken | dict.fromkeys(spread, rest))
+            with suppress(TypeError):  # the values are not those of the dataclass that is spread
+                taken |= {name: made(**rest) for name, made in spread.items()}
+                return each(**taken)
     raise ValueError(f"no kind of event has the values {dict(values)}")
 
 
@@ -107,17 +118,31 @@ def event_in(line: str | bytes) -> dict[str, Any] | None:
     return None
 
 
+def _spread_fields(kind: type[Event]) -> Sequence[tuple[Field[Any], Any]]:
+    """The fields of an event whose own values stand in the line, with their types."""
+    spread = [each for each in fields(kind) if _SPREAD in each.metadata]
+    hints = get_type_hints(kind) if spread else {}
+    return [(each, hints[each.name]) for each in spread]
+
+
 @lru_cache
 def _types(event: str) -> Mapping[str, Sequence[Any]]:
     """The types of each field that a line of this kind names; those of several classes may differ."""
-    classes = KINDS.get(event, ())
-    found: dict[str, list[Any]] = {each.name: [] for kind in classes for each in fields(kind)}
-    for kind in classes:
-        hints, spread = get_type_hints(kind), {each.name for each in fields(kind) if each.metadata == _SPREAD}
-        for name, types in found.items():
-            if name in hints.keys() - spread or spread:  # what has no field of its own is among what is spread
-                types.append(Any if name in spread else hints.get(name, Any))
-    return found
+    kinds = []
+    for kind in KINDS.get(event, ()):
+        spread = _spread_fields(kind)
+        own = _hints(kind, without=[each.name for each, _ in spread])
+        for _, of in spread:
+            own |= _hints(of) if is_dataclass(of) else {}
+        kinds.append((own, any(not is_dataclass(of) for _, of in spread)))
+    names = {name for own, _ in kinds for name in own}
+    # What has no field of its own is among what is spread.
+    return {name: [own.get(name, Any) for own, others in kinds if name in own or others] for name in names}
+
+
+def _hints(kind: Any, without: Sequence[str] = ()) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {each.name: hints[each.name] for each in fields(kind) if each.name not in without}
 
 
 def _fits(value: Any, kind: Any) -> bool:
@@ -127,6 +152,9 @@ def _fits(value: Any, kind: Any) -> bool:
         return any(_fits(value, each) for each in get_args(kind))
     if origin is collections.abc.Mapping:
         return isinstance(value, dict) and all(_fits(each, get_args(kind)[1]) for each in value.values())
+    if origin is tuple:
+        of = get_args(kind)
+        return isinstance(value, list) and len(value) == len(of) and all(map(_fits, value, of))
     if origin is collections.abc.Sequence:
         return isinstance(value, list) and all(_fits(each, get_args(kind)[0]) for each in value)
     if kind is float and value is not None:
@@ -135,7 +163,7 @@ def _fits(value: Any, kind: Any) -> bool:
         return True
     if kind is int:
         return isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63
-    return kind is Any or isinstance(value, str if kind is Path else kind)
+    return kind is Any or isinstance(value, str if issubclass(kind, Path | StrEnum) else kind)
 
 
 def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
@@ -148,14 +176,8 @@ def whole_lines(file: BinaryIO, most: int = LARGEST_LOG) -> Iterator[bytes]:
         within = not line.endswith(b"\n")
 
 
-def _spread(value: Any) -> Mapping[str, Any]:
-    """What a value says of itself in a line, by name; a plain dataclass says all."""
-    if hasattr(value, "told"):
-        return value.told()
-    return _values_of(value) if is_dataclass(value) else value
-
-
 def _values_of(value: Any) -> dict[str, Any]:
+    """What a dataclass holds, by name."""
     return {each.name: getattr(value, each.name) for each in fields(value)}
 
 
@@ -199,7 +221,7 @@ class StateEntered(Event, event="state"):
 
     state: str
     message: str
-    more: Any = field(default_factory=dict, metadata=_SPREAD)
+    more: Any = field(default_factory=dict, metadata={_SPREAD: _values_of})
 
 
 class BlockStarted(Event, event="block_started"):
@@ -248,17 +270,9 @@ class BeamRead(Event, event="beam"):
 
 
 class FrameFlagged(Event, event="flag"):
-    """A check of the monitor begins to flag, or flags at another level; the fields are those of `monitor.Flag`."""
+    """A check of the monitor begins to flag, or flags at another level."""
 
-    check: str
-    level: str
-    frame: int
-    score: float
-    limit: float
-    advice: str
-    region: Sequence[int] | None
-    first: int | None
-    from_region: Sequence[int] | None = None
+    flag: Flag = _spread(Flag.told)
 
 
 class RuleBroken(Event, event="flag"):
@@ -360,21 +374,9 @@ class FitReached(Event, event="progress"):
 
 
 class ScanDone(Event, event="scan_done"):
-    """The scan file is closed; the fields are those of `scan.run.RunResult`, and the status of the file."""
+    """The scan file is closed."""
 
-    path: Path
-    n_frames: int
-    missing: Sequence[int]
-    flags: Mapping[str, Mapping[str, int]]
-    alarmed_frames: int
-    alarmed_views: int
-    retaken: int
-    reference_faults: Sequence[str]
-    seconds: float
-    bytes: int
-    recon: Mapping[str, Any] | None
-    status: str
-    returned: Sequence[Any] = ()
+    result: RunResult = _spread(RunResult.of_file)
 
 
 class ReconStarted(Event, event="recon_started"):
@@ -388,13 +390,13 @@ class ReconStarted(Event, event="recon_started"):
     n_views: int
     axis_col: float
     again: bool | None = None
-    more: Mapping[str, Any] = field(default_factory=dict, metadata=_SPREAD)
+    more: Mapping[str, Any] = field(default_factory=dict, metadata={_SPREAD: _values_of})
 
 
 class Listed(Event):
     """An event that is printed as it is. values: by name, a mapping or a dataclass."""
 
-    values: Any = field(metadata=_SPREAD)
+    values: Any = _spread()
 
 
 class ReconDone(Listed, event="recon_done"):
@@ -429,7 +431,7 @@ class TrialDone(Event, event="trial"):
     message: str
     quality_db: float
     peak_bytes: int | None
-    figures: Mapping[str, Any] = field(metadata=_SPREAD)
+    figures: Mapping[str, Any] = _spread()
 
 
 class BenchStarted(Listed, event="bench_started"):
@@ -449,10 +451,10 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended well. result: `scan.run.RunResult`."""
+    """A run has ended well. result: a `RunResult`; of a line of another process, its values by name."""
 
     folder: Path
-    result: Any = field(metadata=_SPREAD)
+    result: Any = _spread(RunResult.of_run)
 
 
 class Done(Listed, event="done"):
@@ -462,10 +464,10 @@ class Done(Listed, event="done"):
 class VolumeDone(Event, event="done"):
     """A reconstruction of this process has ended well; that of another process is read as `Done`.
 
-    record: of the volume, a `beamline.storage.writers.recon_file.ReconRecord`.
+    record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """
 
-    record: Any = field(metadata=_SPREAD)
+    record: Any = _spread(lambda record: record.told())
 
 
 class Failed(Event, event="failed"):

@@ -41,8 +41,8 @@ def sentence(event: Event) -> str | None:
             return f"{n} {kind} frames ({mode}, {exposure:g} s each)"
         case BlockDone():
             return _missing(event)
-        case FrameFlagged(check, level, frame, advice=advice):
-            return f"{level.capitalize()} ({check}, frame {frame}): {advice}"
+        case FrameFlagged(flag):
+            return f"{flag.level.capitalize()} ({flag.check}, frame {flag.frame}): {flag.advice}"
         case ReconStarted():
             again = " again, from the start" if event.again else ""
             return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
@@ -57,10 +57,11 @@ def sentence(event: Event) -> str | None:
         case EnoughReached(n, planned, mean, low, high):
             spread = f"{mean:.2f} dB ({low:.2f} to {high:.2f})"
             return f"Enough views: {n} of {planned}; the others would add {spread}"
-        case ScanDone(path, n, seconds=seconds, bytes=written):
-            alarms = f", {event.alarmed_frames} WITH AN ALARM" if event.alarmed_frames else ""
-            again = f", {event.retaken} views taken again" if event.retaken else ""
-            return f"Scan {event.status}: {n} frames{again}{alarms}, {size(written)}, {seconds:.1f} s: {path}"
+        case ScanDone(scan):
+            alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
+            again = f", {scan.retaken} views taken again" if scan.retaken else ""
+            told = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
+            return f"{told}, {scan.seconds:.1f} s: {scan.path}"
         case ReconDone(values):
             return f"Volume: {values.get('output', '')}"
         case Failed(message):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.flag import PixelBox as PixelBox
 from beamline.core.jit import njit
 from recon.base.arrays import median_deviation
 
@@ -30,8 +31,6 @@ EVEN, EVEN_NOISE = 0.2, 0.01  # share of a loss of light by which both edges and
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
 
 CellValues = NDArray[np.float32]
-PixelBox = tuple[int, int, int, int]
-"""Pixels of a frame: (first row, row after the last, first column, column after the last)."""
 
 
 @dataclass(frozen=True, eq=False)

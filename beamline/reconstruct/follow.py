@@ -10,7 +10,7 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
-from beamline.reconstruct.growing import ScanFollower
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of

@@ -43,7 +43,7 @@ def judge(
     sink: Sink,
     clock: Clock,
     in_parts: bool = False,
-) -> Judgement:
+) -> VolumeLooks:
     """Measure a volume, compare it with its views and with FBP, and tell `sink` of each warning.
 
     Looks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
@@ -51,7 +51,7 @@ def judge(
     Args:
         in_parts: the output is made of slabs already, so that FBP cannot be kept in it.
     """
-    judged = Judgement(made, prepared, truth, target, context, sink, clock)
+    judged = VolumeLooks(made, prepared, truth, target, context, sink, clock)
     judged.warnings.extend(context.warnings)
     judged.look_at_residual()
     judged.look_for_stray_mass()
@@ -66,7 +66,7 @@ def judge(
 
 
 @dataclass(eq=False)
-class Judgement:
+class VolumeLooks:
     """The looks at one volume, in their order, and what they showed.
 
     Attributes:

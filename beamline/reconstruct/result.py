@@ -10,17 +10,15 @@ import numpy as np
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.judge import Judgement, judge
+from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
-from beamline.reconstruct.recon_report import compose
-from beamline.report.html import write_report
 from beamline.report.record import history_arrays, price_of_decibel, price_text
+from beamline.storage.recon_record import ReconRecord, VolumeInFile
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
-from beamline.storage.writers.recon_file import ReconRecord, VolumeInFile
 from drivers.base.clock import Clock
 from recon.base.method import Reconstruction
 from recon.base.volume import Volume
@@ -56,6 +54,9 @@ def write_result(
     page: Path | None = None
     try:
         if target.report is not None:
+            from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
+            from beamline.report.html import write_report
+
             metrics, parameters = judged.metrics, record.parameters
             report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")
@@ -79,7 +80,7 @@ def write_result(
     return dict(record.metrics)
 
 
-def _record(judged: Judgement, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
+def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
     made, prepared, target = judged.made, judged.prepared, judged.target
 

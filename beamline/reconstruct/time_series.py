@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,10 +28,11 @@ from beamline.reconstruct.series_report import FACTORS, series_page
 from beamline.reconstruct.slabs import memory_of
 from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, VolumesInTime, write_reconstruction
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
-from recon.base.arrays import F64, I64
+from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
@@ -117,19 +120,26 @@ def series_needs(options: ReconOptions, wanted: WantedSeries, clock: Clock) -> S
         raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
 
 
-@dataclass(frozen=True)
-class SeriesDone:
-    """What was written.
+@dataclass(frozen=True, eq=False)
+class TimeSeriesResult:
+    """Volumes in time of a scan file.
 
     Attributes:
-        seconds: of the volumes, from the first view on.
-        moves: the sample moves.
+        output, report: files; None if not requested.
+        shape: [time, z, y, x].
+        seconds: [time] of each volume, from the first view on.
+        axis_col: rotation axis in columns of the full detector.
+        residual: what the volumes leave of the views, over the views.
+        moves: matter moves; False: only its density changes.
         factors: each volume is the mean of all, times factors smooth within matter.
-        chosen: how that was chosen; empty where it was given.
+        chosen: how `moves` was decided; empty where it was given.
         ended_early: the volumes are those reached when it was stopped.
+        grid: of each volume.
+        units: of the volumes, 1/mm, or 1/px if the pixel size is unknown.
+        warnings: sentences.
     """
 
-    output: Path
+    output: Path | None
     report: Path | None
     shape: tuple[int, ...]
     seconds: tuple[float, ...]
@@ -139,6 +149,27 @@ class SeriesDone:
     factors: bool
     chosen: str
     ended_early: bool
+    grid: Grid
+    units: str
+    warnings: tuple[str, ...]
+    _held: F32 | None = field(default=None, repr=False)
+
+    @cached_property
+    def volumes(self) -> F32:
+        """The attenuation [time, z, y, x]; read from `output`, if requested, on first use."""
+        if self._held is not None:
+            return self._held
+        assert self.output is not None
+        volumes = np.empty(self.shape, np.float32)
+        for at in range(len(self.seconds)):
+            with opened_volume(self.output, at=at) as record:
+                volumes[at] = record.volume.data[:]
+        return volumes
+
+    def told(self) -> dict[str, Any]:
+        """What the event `done` says, by name: all up to `ended_early`."""
+        names = [each.name for each in fields(self)]
+        return {name: getattr(self, name) for name in names[: names.index("ended_early") + 1]}
 
     def lines(self) -> list[str]:
         """For people."""
@@ -161,7 +192,7 @@ def reconstruct_series(
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
     stop: StopOnSignal,
-) -> SeriesDone:
+) -> TimeSeriesResult:
     """Fit volumes in time to one scan, and write them.
 
     Before the first sweep of the fit Ctrl-C interrupts, and nothing is written. From then on it writes the volumes so
@@ -252,10 +283,22 @@ def reconstruct_series(
     if options.target.written:
         write_reconstruction(output, record)
     phases.end()
-    return SeriesDone(
-        output, options.target.report, shape, tuple(series.seconds.tolist()), prepared.axis_col, made.residual,
-        made.motion is not None, made.smooth is not None, chosen, early,
-    )  # fmt: skip
+    return TimeSeriesResult(
+        output=output,
+        report=options.target.report,
+        shape=shape,
+        seconds=tuple(series.seconds.tolist()),
+        axis_col=prepared.axis_col,
+        residual=made.residual,
+        moves=made.motion is not None,
+        factors=made.smooth is not None,
+        chosen=chosen,
+        ended_early=early,
+        grid=record.grid,
+        units=record.unit,
+        warnings=tuple(warn.messages),
+        _held=None if options.target.written else series.data,
+    )
 
 
 def _chosen(still: float, moved: float, moves: bool) -> str:

@@ -14,6 +14,7 @@ from beamline.config.load import Config, at_energies, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
 from beamline.core.files import write_whole
+from beamline.core.run_result import RunResult
 from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
@@ -28,7 +29,7 @@ from beamline.scan.resume import (
     open_for_resume,
     recover_run,
 )
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
 from beamline.scan.runs import describe
 from beamline.scan.states import State

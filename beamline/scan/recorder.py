@@ -434,7 +434,7 @@ class Recorder:
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:
-                self._sink(FrameFlagged(**vars(flag)))
+                self._sink(FrameFlagged(flag))
         self._active = active
         self._react(flags)
 

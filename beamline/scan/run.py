@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from beamline.config.load import Config, resolved_yaml
 from beamline.config.monitor import policies
@@ -27,6 +26,7 @@ from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, St
 from beamline.core.files import EVENTS, REPORT
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
+from beamline.core.run_result import RunResult
 from beamline.core.sinks import Announcer, JsonLines
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
@@ -65,39 +65,6 @@ UNSAFE = (
     "the last frames are being written"
 )
 """The same where a device failed while the instrument was made safe; warnings name it."""
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """A finished scan.
-
-    Attributes:
-        path: the scan file; its folder holds everything else. The file that joins the parts of a resumed run.
-        n_frames: rows of the file.
-        missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
-        flags: frames that the monitor flagged: their number by check, then by level.
-        alarmed_frames: frames with an alarm, without those that were taken again.
-        alarmed_views: views among them.
-        retaken: views that were taken again, because they had one or gave no frame.
-        reference_faults: what is wrong with darks and flats, a sentence or more a group.
-        seconds: real time of the whole run.
-        bytes: size of the file that was written.
-        recon: data of the live reconstruction's `done` event; None without one, or where it failed.
-        returned: views on the way back, with the motion of the sample.
-    """
-
-    path: Path
-    n_frames: int
-    missing: tuple[int, ...]
-    flags: Mapping[str, Mapping[str, int]]
-    alarmed_frames: int
-    alarmed_views: int
-    retaken: int
-    reference_faults: tuple[str, ...]
-    seconds: float
-    bytes: int
-    recon: Mapping[str, Any] | None
-    returned: tuple[ReturnedView, ...] = ()
 
 
 def run_scan(
@@ -337,9 +304,11 @@ class _Run:
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
             recon=None,
+            status=status,
             returned=self._returned(path) if unfinished is None else (),
+            sample=self.config.sample.name,
         )
-        self.sink(ScanDone(**vars(result), status=status))
+        self.sink(ScanDone(result))
         if follower is not None:
             useless = unfinished is not None or isinstance(error, ReferencesError)
             recon = follower.finish(live_should_end(self.stop, useless), lambda: self.stop.aborting)

@@ -1,9 +1,8 @@
-"""What all trials of a trade-off share, and the file through which their processes get it."""
+"""What all trials of a scan share, and the folder through which their processes get it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,17 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.files import named_on_failure
-from recon.base.arrays import F32, F64
+from beamline.trials.view_choices import ViewChoice
+from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
-from recon.voxels.emission import Emission
+from recon.base.method import DataUse
+from recon.voxels.emission import Emission, weighted_lines
 
 _COUNTED = ("counts", "survival", "background")
-_OPTIONAL = ("truth", "weights", "of_view", "sections")
+_OPTIONAL = ("truth", "weights", "of_view", "sections", "reference", "regions")
+_MAPPED = ("projections", "weights", *(f"emission.{name}" for name in _COUNTED))  # read only as far as they are used
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """What every trial of a trade-off shares.
+    """What every trial of a scan shares.
 
     Attributes:
         projections, geometry: of the views that may be used.
@@ -34,6 +36,8 @@ class Data:
             same volume.
         sections: [energy, material] attenuation of pure materials, 1/mm; None: views have times, or all show the same.
         states: numbers of two materials that are states of one; empty: there are none.
+        reference: a volume on the same grid that all trials are compared with, beside the truth; None: none.
+        regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
     """
 
     projections: F32
@@ -45,6 +49,8 @@ class Data:
     of_view: F64 | None = None
     sections: F64 | None = None
     states: tuple[int, ...] = ()
+    reference: F32 | None = None
+    regions: NDArray[np.int8] | None = None
 
     @property
     def shown(self) -> F64:
@@ -57,8 +63,23 @@ class Data:
         """Weights of the rays of the views held out; None: all alike."""
         return None if self.weights is None else self.weights[self.geometry.n_views :]
 
-    def save(self, path: Path) -> None:
-        """As .npz, without pickle.
+    def chosen(self, choice: ViewChoice) -> tuple[F32, Geometry, DataUse]:
+        """Line integrals [view, row, col], geometry and use of the views of a choice."""
+        groups = choice.groups
+        assert groups is not None
+        lines, angles = averaged(self.projections, self.geometry.angles, groups)
+        angles.setflags(write=False)
+        geometry = replace(self.geometry.select(groups[:, choice.window // 2]), angles=angles)
+        if self.emission is not None:  # of a window the counts are added
+            emission = self.emission.summed(groups, geometry)
+            lines, weights = weighted_lines(emission)
+            return lines, geometry, DataUse(weights, emission=emission)
+        if self.weights is None:
+            return lines, geometry, DataUse()
+        return lines, geometry, DataUse(np.stack([self.weights[group].min(axis=0) for group in groups]))
+
+    def save(self, folder: Path) -> None:
+        """As .npy files in a new folder, without pickle.
 
         Raises:
             DataError: the disk did not take it.
@@ -70,22 +91,49 @@ class Data:
         arrays["states"] = np.array(self.states, np.intp)
         if self.emission is not None:
             arrays |= {f"emission.{name}": v for name in _COUNTED if (v := getattr(self.emission, name)) is not None}
-        with named_on_failure(path):
-            np.savez(path, allow_pickle=False, **arrays)
+        with named_on_failure(folder):
+            folder.mkdir()
+        for name, array in arrays.items():
+            write_array(folder / f"{name}.npy", array)
 
     @classmethod
-    def load(cls, path: Path) -> Data:
-        with np.load(path, allow_pickle=False) as file:
-            geometry = _geometry("geometry", file)
-            held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
-            counted = {name: file.get(f"emission.{name}") for name in _COUNTED}
-            emission = None if counted["counts"] is None else Emission(geometry=geometry, **counted)
-            optional = {name: file.get(name) for name in _OPTIONAL}
-            states = tuple(file["states"].tolist())
-            return cls(file["projections"], geometry, held, emission=emission, states=states, **optional)
+    def load(cls, folder: Path) -> Data:
+        """What `save` wrote; views and their weights stay in the files until they are used."""
+        arrays = {
+            path.stem: np.load(path, mmap_mode="r" if path.stem in _MAPPED else None, allow_pickle=False)
+            for path in folder.glob("*.npy")
+        }
+        geometry = geometry_in(folder)
+        held = (arrays["held_out"], _geometry("held_out_geometry", folder)) if "held_out" in arrays else None
+        counted: dict[str, Any] = {name: arrays.get(f"emission.{name}") for name in _COUNTED}
+        emission = None if counted["counts"] is None else Emission(geometry=geometry, **counted)
+        optional = {name: arrays.get(name) for name in _OPTIONAL}
+        states = tuple(arrays["states"].tolist())
+        return cls(arrays["projections"], geometry, held, emission=emission, states=states, **optional)
 
 
-def write_array(path: Path, array: F32) -> None:
+def averaged(
+    projections: NDArray[np.float32], angles: NDArray[np.float64], groups: I64
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The views of a row: line integrals [view, row, col] and their mean angles [view].
+
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms.
+
+    Args:
+        projections, angles: of the scan.
+        groups: [view, window].
+    """
+    if groups.shape[1] == 1:
+        return np.asarray(projections[groups[:, 0]], np.float32), angles[groups[:, 0]]
+    out = np.empty((groups.shape[0], *projections.shape[1:]), np.float32)
+    for mean, group in zip(out, groups, strict=True):
+        part = np.asarray(projections[group])
+        least = part.min(axis=0)  # taken out before the exponential, which would be 0 behind much matter
+        mean[:] = least - np.log(np.exp(least - part).mean(axis=0))
+    return out, angles[groups].mean(axis=1)
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
     """Write a .npy file. `np.save` of a path loses the last 4 kB where the disk is full, and says nothing.
 
     Raises:
@@ -95,15 +143,16 @@ def write_array(path: Path, array: F32) -> None:
         np.save(SimpleNamespace(write=file.write), array, allow_pickle=False)
 
 
-def geometry_in(path: Path) -> Geometry:
-    """The geometry of what `Data.save` left, without its views."""
-    with np.load(path, allow_pickle=False) as file:
-        return _geometry("geometry", file)
+def geometry_in(folder: Path) -> Geometry:
+    """The geometry of what `Data.save` wrote, without its views."""
+    return _geometry("geometry", folder)
 
 
 def _geometry_arrays(prefix: str, geometry: Geometry) -> dict[str, NDArray[Any]]:
     return {f"{prefix}.{name}": array for name, array in arrays_of(geometry).items()}
 
 
-def _geometry(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Geometry:
-    return geometry_of_arrays({f.name: arrays[f"{prefix}.{f.name}"] for f in fields(Geometry)})
+def _geometry(prefix: str, folder: Path) -> Geometry:
+    return geometry_of_arrays({
+        f.name: np.load(folder / f"{prefix}.{f.name}.npy", allow_pickle=False) for f in fields(Geometry)
+    })  # fmt: skip

@@ -1,18 +1,20 @@
-"""Pictures of a trade-off: quality against cost of every trial with the Pareto front, and residuals against time."""
+"""Pictures of a table of trials: figures of every trial, against time, memory and dose, and residuals in its run."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from beamline.report.figures import png
+from beamline.projections.scan_statistics import dose_scale
+from beamline.report.figures import DPI, WIDTH, png
+from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
-from beamline.trials.varied import colour_of
+from recon.methods import names
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
@@ -121,3 +123,72 @@ _WORDS = {
     "method": "baseline", "steps": "steps, iterations", "views": "fewer views", "gaussians": "number of Gaussians",
     "parts": "parts of the views", "one fit": "one fit of all views",
 }  # fmt: skip
+
+Value = Callable[[Outcome], float | None]
+
+
+def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
+    """Every figure of all rows, a line a method.
+
+    Args:
+        values: of a row, by the label of their axis.
+    """
+    rows = list(dict.fromkeys(outcome.trial.choice.label for outcome in table.compared if outcome.trial.choice))
+    down = -(-len(values) // 2)
+    height = 2.0 * down + 2.2
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
+    figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
+    for axes, (label, value) in zip(panels, values.items(), strict=False):
+        for method, found in _by_method(table, value).items():
+            places = [rows.index(outcome.trial.choice.label) for outcome, _ in found if outcome.trial.choice]
+            axes.plot(places, [v for _, v in found], marker="o", ms=4, lw=0.8, color=colour_of(method), label=method)
+        axes.set_ylabel(label, fontsize=8)
+        axes.set_xticks(range(len(rows)), rows, rotation=90, fontsize=6.5)
+        axes.tick_params(axis="y", labelsize=7)
+        axes.grid(alpha=0.3)
+    panels[0].legend(fontsize=8)
+    return png(figure)
+
+
+def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
+    """A figure of all rows against dose and against time, a colour a method."""
+    figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
+    by_dose, by_time = figure.subplots(1, 2, sharey=True)
+    a_frame, dose = dose_scale(table.light)
+    for method, found in _by_method(table, value).items():
+        doses, times = ([o.trial.frames * a_frame for o, _ in found], [o.cpu_seconds for o, _ in found])
+        for axes, cost in ((by_dose, doses), (by_time, times)):
+            axes.plot(cost, [v for _, v in found], "o", ms=4, color=colour_of(method), label=method)
+    by_dose.set(xlabel=dose, ylabel=label, xscale="log")
+    by_time.set(xlabel="processor time (s)", xscale="log")
+    for axes in (by_dose, by_time):
+        axes.grid(alpha=0.3)
+    by_dose.legend(fontsize=8)
+    return png(figure)
+
+
+def _by_method(table: TrialTable, value: Value) -> dict[str, list[tuple[Outcome, float]]]:
+    """The rows of each method that have a finite value."""
+    found: dict[str, list[tuple[Outcome, float]]] = {}
+    for outcome in table.compared:
+        of_row, rows = value(outcome), found.setdefault(outcome.trial.method, [])
+        if of_row is not None and math.isfinite(of_row):
+            rows.append((outcome, of_row))
+    return found
+
+
+def colour_of(method: str) -> str:
+    """Of a method in pictures, as matplotlib takes it; a method without a line in `COLOURS` has one that is left."""
+    others = [name for name in names() if name not in COLOURS]
+    return COLOURS[method] if method in COLOURS else _SPARE[others.index(method) % len(_SPARE)]
+
+
+COLOURS: Mapping[str, str] = {
+    "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
+    "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
+    "pnp-dct": "maroon",
+    "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
+    "series": "darkgreen", "materials": "darkgreen",
+}  # fmt: skip
+_SPARE = ("tab:pink", "black")

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
 from beamline.trials.trial import Outcome, Status, Trial
+
+DATA = "data"
+"""Folder of `Data` in the one of all trials."""
 
 
 def command(job: Path) -> Sequence[str]:
@@ -25,11 +28,11 @@ def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | No
     """Fill the cache of compiled kernels for these trials, so that no trial's memory includes the compiler's.
 
     Args:
-        work: a folder with data.npz.
+        work: a folder with the data, `DATA`.
         max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
     """
     kinds = {_kernels(trial): trial for trial in trials}
-    job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
+    job = {"data": str(work / DATA), "compile": [trial.as_job() for trial in kinds.values()]}
     _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
 
 
@@ -44,14 +47,14 @@ def run_trial(
     """Run one trial in a process of its own, which has ended when this returns or raises.
 
     Args:
-        work: a folder with data.npz.
+        work: a folder with the data, `DATA`.
         max_seconds: after which the process is killed; None: no limit.
         keep: a .npy file for its volume [z, y, x]; None: the volume is forgotten.
 
     Raises:
         DataError: the disk did not take the job or the volume: trials to come would fail, too.
     """
-    job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed, "keep": keep and str(keep)}
+    job = {"data": str(work / DATA), "trial": trial.as_job(), "seed": seed, "keep": keep and str(keep)}
     return _outcome(trial, _run(job, work, max_seconds))
 
 

@@ -1,39 +1,44 @@
-"""Runs a study: each row by each method in a process of its own, all compared with the FBP of the whole scan."""
+"""Study: a scan from fewer or averaged views, by some methods, compared with the FBP of all its views."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Event, Sink, StudyStarted, TrialDone, TrialReached
-from beamline.core.files import result_folder
+from beamline.core.events import Sink, StudyStarted
+from beamline.core.files import REPORT
 from beamline.core.machine import machine
-from beamline.core.sinks import Warnings
+from beamline.core.sinks import Warn
+from beamline.report.html import Picture
+from beamline.report.metrics import METRICS, Metric
 from beamline.report.slice_sheet import SliceSheet
-from beamline.trials.data import Data, write_array
-from beamline.trials.launch import compile_kernels, run_trial
-from beamline.trials.opened import ComparedScan, OpenedScan, opened_scan, until_stopped
-from beamline.trials.study_figures import write_page
-from beamline.trials.study_table import Cell, StudyTable, write_table
-from beamline.trials.trial import Outcome, Timed, Trial, in_time, seconds_left
-from beamline.trials.view_choices import Study, StudyRow, ViewSet, averaged
+from beamline.trials.data import Data
+from beamline.trials.figures import against_cost, figures_of_rows
+from beamline.trials.front import dose_columns
+from beamline.trials.layout import Column, records
+from beamline.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
+from beamline.trials.table import TrialTable
+from beamline.trials.trial import Outcome, Trial
+from beamline.trials.view_choices import Study, ViewChoice, ViewSet
 from drivers.base.clock import Clock
-from recon.assess import metrics
-from recon.base.arrays import F32
-from recon.base.geometry import Geometry
+from recon.base.choices import Filter
 from recon.base.method import Plain
-from recon.methods import BASELINE
-from recon.voxels.emission import Emission, weighted_lines
-from recon.voxels.fbp import Filter
+from recon.methods import BASELINE, by_name
 
 REFERENCE = "FBP of all views"
+_FIGURES = {
+    "psnr_fbp": ("PSNR", "psnr"), "ssim_fbp": ("SSIM", "ssim3d"), "psnr_truth": ("PSNR truth", "psnr"),
+    "ssim_truth": ("SSIM truth", "ssim3d"), "snr": ("SNR", "snr"), "cnr": ("CNR", "cnr"),
+}  # fmt: skip
+"""Heading, and the metric that says how many digits it has, by name in files."""
+_MEASURED = {"psnr_truth": "psnr", "ssim_truth": "ssim3d"}  # names of metrics against the truth where trials end
 
 
 @dataclass(frozen=True)
@@ -60,100 +65,58 @@ class StudyOptions:
     command: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class _Judge:
-    """What every volume is compared with.
-
-    Attributes:
-        reference: FBP of all views, on `Grid.matching` of their geometry.
-        truth: on the same grid; None where nobody knows it.
-        mask: of the dense and the empty regions, see `_regions`; None without two.
-    """
-
-    reference: F32
-    truth: F32 | None
-    mask: NDArray[np.int8] | None
-
-    def figures(self, volume: F32) -> dict[str, float]:
-        """By the names of `table.HEADINGS`."""
-        found = {"psnr_fbp": metrics.psnr(self.reference, volume), "ssim_fbp": metrics.ssim3d(self.reference, volume)}
-        if self.truth is not None:
-            found |= {"psnr_truth": metrics.psnr(self.truth, volume), "ssim_truth": metrics.ssim3d(self.truth, volume)}
-        if self.mask is not None:
-            found["snr"], found["cnr"] = metrics.snr_cnr(metrics.sampled(volume), self.mask)
-        return found
+def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> TrialTable:
+    """Run all rows of a study, see `run_comparison`."""
+    limits = RunLimits(options.scan.folder, options.seed)
+    return run_comparison(partial(planned_study, options), limits, sink, clock, now)
 
 
-def _regions(reference: F32, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions, whole as published; None without contrast."""
-    try:
-        return metrics.kmeans_mask(metrics.sampled(reference), seed)
-    except ValueError:
-        return None
-
-
-def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[], float] = time.monotonic) -> StudyTable:
-    """Run all rows and write table, pictures and page into the folder. The event `done` names the folder.
-
-    The table is written after every row. After Ctrl-C the table is `stopped`. A folder without results is removed. The
-    views lie in a file of the folder while the study runs; the memory holds the views of one row.
+def planned_study(options: StudyOptions, warn: Warn) -> tuple[Data, Planned]:
+    """Read and correct the views, and choose those of each row.
 
     Raises:
-        ConfigError, DataError: nothing was written, or the table of the rows that were done.
-        KeyboardInterrupt: before the first row was done; nothing was written.
+        ConfigError, DataError: nothing was written.
     """
-    folder, started, path = options.scan.folder, clock.now(), options.scan.source.path
-    warn = Warnings(sink, clock)
-    scan = opened_scan(options.scan, warn)
-    table = _planned(options, scan)
-    todo = [cell for cell in table.cells if cell.row.groups is not None]
-    if not todo:
-        raise DataError(
-            f"{path}: {scan.prepared.geometry.n_views} views are too few for any row of {options.study.name}: "
-            f"{table.cells[-1].said}. Take a scan with more views."
-        )
-    left_out = len(table.cells) - len(todo)
-    sink(StudyStarted(path, len(todo), left_out, options.study.name, time=clock.now()))
-    for cell in table.cells:
-        if cell.row.groups is None and cell.method == options.methods[0]:
-            warn(f"{cell.row.label} is left out: {cell.message}")
-    slices = SliceSheet()
-    with result_folder(folder) as work:
-        write_array(work / "views.npy", scan.prepared.projections.data)
-        if (rays := scan.prepared.rays_there()) is not None:
-            write_array(work / "rays.npy", rays)
-        prepared = scan.prepared
-        rig = Rig(work, prepared.geometry, options.seed, options.settings, prepared.emission, options.seconds)
-        truth = scan.truth
-        del scan, prepared, rays  # from here on the views are in the file alone
-        whole = StudyRow(REFERENCE, np.arange(rig.geometry.n_views)[:, None])
-        reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
-        if reference is None:
-            raise DataError(f"{path}: the FBP of all views, to compare with, failed: {outcome.message}")
-        judge = _Judge(reference, truth, _regions(reference if truth is None else truth, options.seed))
-        slices.add(REFERENCE, reference)
-        if truth is not None:
-            slices.add("truth", truth)
-        rig.compile(options.methods)
-
-        def stamped(event: Event) -> None:
-            sink(replace(event, time=clock.now()))
-
-        table = until_stopped(table, _each(table, rig, judge, slices, stamped, now), folder, write_table)
-    write_page(folder, table, slices)
-    summary = {"output": folder, "rows": len(todo), "done": table.n_done, "stopped": table.stopped}
-    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
-    return table
-
-
-def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
-    """The table before any row is done."""
-    geometry, truth = scan.prepared.geometry, scan.truth is not None
+    path, opened = options.scan.source.path, opened_scan(options.scan, warn)
+    prepared, truth = opened.prepared, opened.truth is not None
+    geometry = prepared.geometry
     turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
     places = np.concatenate((geometry.shifts, turns), axis=1)
-    rows = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
+    choices = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
+    table = TrialTable(
+        tuple(_row(choice, method, options) for choice in choices for method in options.methods),
+        "psnr_fbp",
+        prepared.length_unit,
+        machine(),
+        {**opened.facts, "views to choose from": str(geometry.n_views)},
+        options.command,
+        light=opened.light,
+        notes=_notes(options, geometry.n_views, truth),
+    )
+    if not table.todo:
+        raise DataError(
+            f"{path}: {geometry.n_views} views are too few for any row of {options.study.name}: "
+            f"left out: {choices[-1].reason}. Take a scan with more views."
+        )
+    for choice in choices:
+        if choice.groups is None:
+            warn(f"{choice.label} is left out: {choice.reason}")
+    whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
+    reference = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
+    data = Data(prepared.projections.data, geometry, None, opened.truth, prepared.rays_there(), prepared.emission)
+    started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
+    return data, Planned(table, StudyLayout(options.study), started, reference)
+
+
+def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
+    """A row before it is done."""
+    trial = Trial("method", method, choice.n_views, settings=dict(options.settings.get(method, {})), choice=choice)
+    return Outcome(trial.in_time(options.seconds), "not run", message=choice.reason)
+
+
+def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
     notes = [
-        f"PSNR and SSIM are against the {REFERENCE} ({geometry.n_views}, {options.filter}): it has noise and streaks "
+        f"PSNR and SSIM are against the {REFERENCE} ({n_views}, {options.filter}): it has noise and streaks "
         "of its own, which rows share as far as they share its views.",
         "SNR and CNR are of the whole dense and empty region, with their rims (k-means of the "
         + ("truth" if truth else "FBP of all views")
@@ -166,92 +129,130 @@ def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
         notes.append(f"Each row had {options.seconds:g} s; direct methods take what they take.")
     if truth:
         notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
-    return StudyTable(
-        options.study,
-        tuple(Cell(row, method, message=row.reason) for row in rows for method in options.methods),
-        {**scan.facts, "views to choose from": str(geometry.n_views)},
-        machine(),
-        options.command,
-        notes,
-        light=scan.light,
-    )
+    return notes
 
 
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry.
+@dataclass(frozen=True)
+class StudyLayout:
+    """The table of a study: a row for each choice of views and method."""
 
-    Where rays have weights, rays.npy has them. Where the sample emits, `emission` has the counts behind the views.
-    `seconds`: of each row, as in `StudyOptions`.
-    """
+    study: Study
+    name: str = "study"
+    page: str = REPORT
+    unit: str = "rows"
 
-    work: Path
-    geometry: Geometry
-    seed: int
-    settings: Mapping[str, Mapping[str, Plain]]
-    emission: Emission | None = None
-    seconds: float | None = None
+    @property
+    def title(self) -> str:
+        return self.study.title
 
-    def trial(self, method: str, n_views: int, settings: Mapping[str, Plain] | None = None) -> Trial:
-        """A row by a method, by `settings` instead of the method's own."""
-        own = dict(self.settings.get(method, {}) if settings is None else settings)
-        return in_time(Trial("method", method, n_views, settings=own), self.seconds)
+    @property
+    def question(self) -> str:
+        return self.study.question
 
-    def reconstructed(
-        self, row: StudyRow, method: str, settings: Mapping[str, Plain] | None = None
-    ) -> tuple[F32 | None, Outcome]:
-        """The volume of a row, by `settings` instead of the method's own; None if the method failed."""
-        assert row.groups is not None
-        # Opened here and closed with the return: Windows removes no file that is open.
-        data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)
-        angles.setflags(write=False)
-        geometry = replace(self.geometry.select(row.groups[:, row.window // 2]), angles=angles)
-        weights = None
-        if (self.work / "rays.npy").exists():
-            of_scan = np.load(self.work / "rays.npy", mmap_mode="r")
-            weights = np.stack([of_scan[group].min(axis=0) for group in row.groups])
-        counted = None
-        if self.emission is not None:  # of a window the counts are added
-            counted = self.emission.summed(row.groups, geometry)
-            data, weights = weighted_lines(counted)
-        Data(data, geometry, None, None, weights, counted).save(self.work / "data.npz")
-        del data
-        kept = self.work / "volume.npy"
-        outcome = run_trial(self.trial(method, row.n_views, settings), self.work, self.seed, keep=kept)
-        return (np.load(kept), outcome) if outcome.status == "done" else (None, outcome)
+    def labels(self, outcome: Outcome) -> tuple[str, ...]:
+        return _choice(outcome).label, outcome.trial.method
 
-    def compile(self, methods: Sequence[str]) -> None:
-        """Compile the kernels of these methods; the folder has the data of a row."""
-        compile_kernels([self.trial(method, 2) for method in methods], self.work)
+    def columns(self, table: TrialTable) -> Sequence[Column]:
+        timed, shown = table.timed, names(table)
+        return [
+            Column("row", lambda o: _choice(o).label),
+            Column("method", lambda o: o.trial.method),
+            Column("views", lambda o: o.trial.views),
+            Column("window", lambda o: _choice(o).window),
+            Column("frames", lambda o: o.trial.frames),
+            *dose_columns(table),
+            Column("status", lambda o: o.status),
+            Column("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
+            Column("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
+            Column("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"),
+            Column("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
+            *(_figure(name, name in shown) for name in _FIGURES),
+            Column("message", lambda o: o.message),
+        ]
+
+    def marked(self, table: TrialTable) -> set[int]:
+        return set()
+
+    def legend(self, table: TrialTable) -> Sequence[str]:
+        return []
+
+    def sentences(self, table: TrialTable) -> Sequence[str]:
+        return [*draws(table), *table.notes]
+
+    def record(self, table: TrialTable) -> Mapping[str, Any]:
+        return {"study": self.study.name, "notes": list(table.notes), "rows": records(table, self)}
+
+    def pictures(self, table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
+        pictures, figures = [], names(table)
+        if table.compared:
+            caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
+            axes = {name: _FIGURES[name][0] + " (dB)" * bool(_metric(name).unit) for name in figures}
+            picture = figures_of_rows(table, {axes[name]: partial(value_of, name) for name in figures})
+            pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
+            first = "psnr_truth" if "psnr_truth" in figures else figures[0]
+            caption = "Each frame of the scan has the same dose; one that several views share is counted once."
+            picture = against_cost(table, axes[first], partial(value_of, first))
+            pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
+        for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
+            caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
+            picture = slices.png(slices.labels(method))
+            title = f"{by_name(method).label}, slice by slice"
+            pictures.append((f"slices_{method}.png", Picture(title, caption, picture)))
+        return pictures
 
 
-def _each(
-    table: StudyTable, rig: Rig, judge: _Judge, slices: SliceSheet, sink: Sink, now: Callable[[], float]
-) -> Iterator[StudyTable]:
-    """The table after each cell, and after one that Ctrl-C interrupted."""
-    timed: list[Timed] = []
-    todo = [(index, cell) for index, cell in enumerate(table.cells) if cell.row.groups is not None]
-    trials = [rig.trial(cell.method, cell.row.n_views) for _, cell in todo]
-    begin = now()
-    for n, (index, cell) in enumerate(todo):
-        eta, rate = seconds_left(timed, trials[n:]), 60 * n / max(now() - begin, 1e-9)
-        sink(TrialReached("study", n, len(todo), cell.label, eta, rate))
-        started = now()
-        try:
-            volume, outcome = rig.reconstructed(cell.row, cell.method)
-            figures = {} if volume is None else judge.figures(volume)
-        except KeyboardInterrupt:
-            yield table.with_cell(index, replace(cell, status="interrupted", message="ended before it was done"))
-            raise
-        if volume is not None:
-            slices.add(cell.label, volume, cell.row.family, cell.method)
-        cell = replace(
-            cell, status=outcome.status, figures=figures, seconds=outcome.seconds, cpu_seconds=outcome.cpu_seconds,
-            message=outcome.message, seconds_asked=outcome.trial.seconds_asked, reached=outcome.reached,
-        )  # fmt: skip
-        timed.append(Timed.of(outcome, now() - started))
-        table = table.with_cell(index, cell)
-        yield table
-        said, quality = (cell.status, cell.seconds, cell.message), figures.get("psnr_fbp", math.nan)
-        more = {"method": cell.method, **figures}
-        sink(TrialDone(n + 1, len(todo), cell.label, *said, quality, outcome.peak_bytes, more))
+def _choice(outcome: Outcome) -> ViewChoice:
+    assert outcome.trial.choice is not None
+    return outcome.trial.choice
+
+
+def value_of(name: str, outcome: Outcome) -> float | None:
+    """A figure of a row; None where it is not known."""
+    return outcome.metrics.get(_MEASURED.get(name, name))
+
+
+def names(table: TrialTable) -> list[str]:
+    """Figures that any row has."""
+    return [name for name in _FIGURES if any(value_of(name, outcome) is not None for outcome in table.outcomes)]
+
+
+def _metric(name: str) -> Metric:
+    return METRICS[_FIGURES[name][1]]
+
+
+def formatted(name: str, value: float) -> str:
+    """A figure with its digits; "equal" for the PSNR of two equal volumes."""
+    metric = _metric(name)
+    if math.isfinite(value):
+        return f"{value:.{metric.digits}f}"
+    return "equal" if metric is METRICS["psnr"] and value > 0 else "undefined"
+
+
+def _figure(name: str, shown: bool) -> Column:
+    heading = _FIGURES[name][0]
+
+    def in_words(outcome: Outcome) -> str:
+        value = value_of(name, outcome)
+        return "–" if value is None else formatted(name, value)
+
+    return Column(name, partial(value_of, name), heading * shown, heading, 12, in_words, metric=True)
+
+
+def _asked(outcome: Outcome) -> str:
+    seconds = outcome.trial.seconds_asked
+    return "–" if seconds is None else f"{seconds:g}"
+
+
+def draws(table: TrialTable) -> list[str]:
+    """Sentences: mean and range of the figures over the draws of one choice."""
+    sentences = []
+    families = dict.fromkeys((_choice(o).family, o.trial.method) for o in table.compared if _choice(o).family)
+    for family, method in families:
+        rows = [o for o in table.compared if (_choice(o).family, o.trial.method) == (family, method)]
+        parts = []
+        for name in names(table):
+            values = [value for o in rows if (value := value_of(name, o)) is not None]
+            low, high = formatted(name, min(values)), formatted(name, max(values))
+            parts.append(f"{_FIGURES[name][0]} {formatted(name, float(np.mean(values)))} ({low} to {high})")
+        sentences.append(f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}.")
+    return sentences

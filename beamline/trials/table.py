@@ -1,17 +1,16 @@
-"""All trials of a trade-off with their outcomes, and which of them are on the Pareto front of a cost."""
+"""All trials of a scan with their outcomes, and which of them are on the Pareto front of a cost."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beamline.core.events import TrialDone
 from beamline.projections.scan_statistics import Light, dose_scale
 from beamline.trials import pareto
-from beamline.trials.trial import Outcome
+from beamline.trials.trial import QUALITIES, Outcome, Quality
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
@@ -43,15 +42,16 @@ MEMORY = TrialCost(
 
 @dataclass(frozen=True)
 class TrialTable:
-    """All trials of a trade-off, with the scan and the machine that they ran on.
+    """All trials of a scan, with the scan and the machine that they ran on.
 
     Attributes:
-        outcomes: in the order of the plan.
-        by: the measure of quality: "psnr" or "residual_held_out", both as dB.
+        outcomes: in the order of the plan, also of trials that are left out.
+        by: the measure of quality, of `QUALITIES`.
         length_unit: of the resolution, "mm" or "px".
         scan: facts for people, by name.
         stopped: it was interrupted before all trials were done.
-        light: of a view; None: the dose is counted in frames.
+        light: of a frame; None: the dose is counted in frames.
+        notes: sentences on what the figures mean.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -62,6 +62,7 @@ class TrialTable:
     command: str
     stopped: bool = False
     light: Light | None = None
+    notes: Sequence[str] = ()
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
@@ -77,9 +78,9 @@ class TrialTable:
 
     @property
     def dose(self) -> TrialCost:
-        """Each view is a frame of the scan."""
+        """Each frame of the scan that several views share is counted once."""
         a_frame, axis = dose_scale(self.light)
-        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.views))
+        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.frames))
 
     @property
     def compared(self) -> tuple[Outcome, ...]:
@@ -92,8 +93,13 @@ class TrialTable:
         return [outcome.quality(self.by) for outcome in self.compared]
 
     @property
-    def quality_name(self) -> str:
-        return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
+    def quality(self) -> Quality:
+        return QUALITIES[self.by]
+
+    @property
+    def todo(self) -> list[int]:
+        """Numbers of the trials that are not left out."""
+        return [n for n, outcome in enumerate(self.outcomes) if not outcome.trial.left_out]
 
     def costs(self, cost: TrialCost) -> list[float]:
         """The cost of each trial in `compared`."""
@@ -119,16 +125,8 @@ class TrialTable:
         noise of a view is in both of its residuals, and so not in their difference.
         """
         left = [np.asarray(self.compared[k].left) for k in (i, j)]
-        if self.by == "psnr" or min(each.size for each in left) < 2 or left[0].size != left[1].size:
+        if not self.quality.of_views or min(each.size for each in left) < 2 or left[0].size != left[1].size:
             return LEAST_GAIN
         apart, level = left[0] - left[1], (left[0].mean() + left[1].mean()) / 2
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
-
-    def event(self, index: int, outcome: Outcome) -> TrialDone:
-        """The trial of this index, as an event; `gaussians` are those at its start, as in its settings."""
-        figures = outcome.trial.as_record() | {
-            "cpu_seconds": outcome.cpu_seconds, "gaussians_end": outcome.gaussians, **outcome.metrics
-        }  # fmt: skip
-        said = figures.pop("label"), outcome.status, outcome.seconds, outcome.message, outcome.quality(self.by)
-        return TrialDone(index + 1, len(self.outcomes), *said, outcome.peak_bytes, figures)

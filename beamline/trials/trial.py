@@ -1,21 +1,22 @@
-"""Trials: which settings a trade-off tries, in which order, and how long the rest will take; pure values."""
+"""Trial: one reconstruction to make, of which views, how and how long, and what became of it; pure values."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, Self
 
-from beamline.trials.varied import JOINT, MOTION, Depth, ended_by_time, trials_of, work_of
+import numpy as np
+
+from beamline.trials.joint import JOINT, JointFit
+from beamline.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
-from recon.methods import build, by_name
+from recon.methods import build, by_name, has_setting
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
-_WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
-_LEAST_OF_PART = 6  # views
-_SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
+_ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,14 @@ class Trial:
 
     Attributes:
         group: what it varies: "method" where nothing.
-        method: its name in `recon.methods`, or in `beamline.trials.varied.JOINT`.
-        views: how many, spread evenly over those chosen.
+        method: its name in `recon.methods`, or in `beamline.trials.joint.JOINT`.
+        views: how many, spread evenly over those of the scan, or as many as `choice` has.
         binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
         parts: of the views, in time or by energy, each reconstructed by itself.
         seconds_asked: after which a reconstruction ends; None: when its work is done.
+        choice: which views; None: `views` of them, evenly spread.
     """
 
     group: str
@@ -41,6 +43,26 @@ class Trial:
     halves: bool = False
     parts: int = 1
     seconds_asked: float | None = None
+    choice: ViewChoice | None = None
+
+    @property
+    def joint(self) -> JointFit | None:
+        """The fit of all views that show several volumes; None: a method makes one volume of them.
+
+        Raises:
+            ValueError: for a setting that there is not.
+        """
+        return JOINT[self.method](**self.settings) if self.method in JOINT else None
+
+    @property
+    def left_out(self) -> bool:
+        """The scan has not the views that it asks for."""
+        return self.choice is not None and self.choice.groups is None
+
+    @property
+    def frames(self) -> int:
+        """Frames of the scan that it takes, each counted once: its dose."""
+        return self.views if self.choice is None else self.choice.frames
 
     def build(self) -> Method:
         """The method with the settings of the trial.
@@ -51,9 +73,20 @@ class Trial:
         method, seconds = by_name(self.method), self.seconds_asked
         return build(method, {**self.settings, **({} if seconds is None else ended_by_time(method, seconds))})
 
+    def in_time(self, seconds: float | None) -> Trial:
+        """The trial, to end when its seconds are over, if any; a direct method takes what it takes."""
+        method = by_name(self.method)
+        if seconds is None or method.traits.direct:
+            return self
+        by_time = ended_by_time(method, seconds)
+        kept = {name: value for name, value in self.settings.items() if name not in by_time}
+        return replace(self, settings=kept, seconds_asked=seconds)
+
     @property
     def label(self) -> str:
         """The settings in a few words."""
+        if self.choice is not None:
+            return f"{self.choice.label}: {self.method}"
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
         parts += [f"{self.parts} parts"] if self.parts > 1 else []
@@ -63,16 +96,37 @@ class Trial:
     @property
     def title(self) -> str:
         """Of its slice in a picture."""
+        if self.choice is not None:
+            return self.label
         if self.group == "method":
             return by_name(self.method).label
-        told = self.settings if self.method in JOINT else {}
+        told = {} if self.joint is None else self.settings
         parts = [f"{self.parts} parts"] if self.parts > 1 else []
         return ", ".join([self.method, *parts, *(_in_words(name, value) for name, value in told.items())])
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table, JSON or an event."""
-        record = {f.name: getattr(self, f.name) for f in fields(self)}
+        record = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "choice"}
         return {**record, **record.pop("settings"), "label": self.label}
+
+    def as_job(self) -> dict[str, Any]:
+        """Plain values that `of_job` takes."""
+        record = {f.name: getattr(self, f.name) for f in fields(self)}
+        groups = None if self.choice is None or self.choice.groups is None else self.choice.groups.tolist()
+        return {**record, "choice": self.choice and {"label": self.choice.label, "groups": groups}}
+
+    @classmethod
+    def of_job(cls, job: Mapping[str, Any]) -> Self:
+        choice = job["choice"] and ViewChoice(job["choice"]["label"], np.array(job["choice"]["groups"], np.int64))
+        return cls(**{**job, "choice": choice})
+
+
+def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
+    """The settings with which so many seconds, and nothing else, end a run of the method; see `Traits.own_length`."""
+    if method.traits.own_length:
+        return {}
+    lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
+    return {name: value for name, value in lengths.items() if has_setting(method, name)}
 
 
 def _in_words(name: str, value: Plain) -> str:
@@ -106,7 +160,8 @@ class Outcome:
         status: only "done" comes with figures.
         seconds: wall time of the reconstruction, without compilation and measuring.
         peak_bytes: of its process; None where the system does not tell.
-        metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), by name.
+        metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), and with a reference psnr_fbp,
+            ssim_fbp, snr, cnr; by name.
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of its own record of the residual.
         curve_of: which views that record is of, in words.
@@ -129,143 +184,43 @@ class Outcome:
     reached: str = ""
 
     def quality(self, by: str) -> float:
-        """dB by "psnr", or by "residual_held_out" as -20 log10 of it; NaN where it is not known."""
-        return decibels(by, self.metrics.get(by, math.nan))
+        """dB by a metric in `QUALITIES`; NaN where it is not known."""
+        return QUALITIES[by].decibels(self.metrics.get(by, math.nan))
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table or JSON."""
-        return {**asdict(self), "trial": self.trial.as_record()}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"trial": self.trial.as_record()}
 
 
-def decibels(name: str, value: float) -> float:
-    """A metric as dB, more being better: PSNR as it is, a residual r as -20 log10 r."""
-    if name != "residual_held_out":
-        return value
-    return -20 * math.log10(value) if value > 0 else math.nan
+@dataclass(frozen=True)
+class Quality:
+    """A metric that trials are compared by, in dB; more is better.
+
+    Attributes:
+        words: in sentences.
+        axis: label in pictures.
+        decibels: of a value of the metric; NaN where there are none.
+        of_views: views held out are measured, each for itself.
+    """
+
+    words: str
+    axis: str
+    decibels: Callable[[float], float]
+    of_views: bool = False
+
+
+QUALITIES: Mapping[str, Quality] = {
+    "psnr": Quality("PSNR", "PSNR (dB)", lambda value: value),
+    "psnr_fbp": Quality("PSNR", "PSNR (dB)", lambda value: value),
+    "residual_held_out": Quality(
+        "−20 log₁₀ of the held-out residual",
+        "held-out residual (dB below the data)",
+        lambda value: -20 * math.log10(value) if value > 0 else math.nan,
+        of_views=True,
+    ),
+}
+"""By the name of the metric."""
 
 
 def thousands(n: int) -> str:
     return f"{n / 1000:.3g}k Gaussians" if n >= 1000 else f"{n} Gaussians"
-
-
-def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
-    """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
-
-    Args:
-        methods: names in `recon.methods`, in the order wanted.
-        gaussians: how many a fit would start from by itself.
-        depth: "quick" has about half as many trials as "full", and shorter ones.
-
-    Raises:
-        ValueError: for a method that there is not.
-    """
-    counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
-    first: list[Trial] = []
-    rest: list[Trial] = []
-    for method in methods:
-        base, *others = (
-            Trial(tried.varies, method, n_views, tried.binning, tried.settings)
-            for tried in trials_of(method, gaussians, depth)
-        )
-        first.append(replace(base, halves=True))
-        rest += [replace(base, group="views", views=n) for n in counts]
-        rest += others
-    return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
-
-
-def in_time(trial: Trial, seconds: float | None) -> Trial:
-    """The trial, to end when its seconds are over, if any; a direct method takes what it takes."""
-    method = by_name(trial.method)
-    if seconds is None or method.traits.direct:
-        return trial
-    by_time = ended_by_time(method, seconds)
-    kept = {name: value for name, value in trial.settings.items() if name not in by_time}
-    return replace(trial, settings=kept, seconds_asked=seconds)
-
-
-def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
-    """Each method once, all with the same time."""
-    return tuple(in_time(base, seconds) for base in _baselines(methods, n_views, gaussians))
-
-
-def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """The trials in an order for little time: each method once, direct ones first, without half-set resolutions.
-
-    These take two more reconstructions each, and say less than one of another method.
-    """
-    once = [replace(trial, halves=False) for trial in trials]
-    alone = [trial for trial in once if trial.group == "method"]
-    direct = [trial for trial in alone if by_name(trial.method).traits.direct]
-    return tuple(dict.fromkeys([*direct, *alone, *once]))
-
-
-def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
-    """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
-    alone = _baselines(methods, n_views, gaussians)
-    numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
-    joint = [Trial("one fit", "series", n_views, settings={"volumes": volumes, "motion": how}) for how in MOTION]
-    return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *joint
-
-
-def plan_of_energies(
-    methods: Sequence[str], n_views: int, gaussians: int, energies: int, states: bool
-) -> tuple[Trial, ...]:
-    """Each energy by itself with each method, then one fit of all materials, and with the share of two states."""
-    alone = [replace(base, group="parts", parts=energies) for base in _baselines(methods, n_views, gaussians)]
-    joint = [Trial("one fit", "materials", n_views)]
-    joint += [Trial("one fit", "materials", n_views, settings={"share": True})] if states else []
-    return *alone, *joint
-
-
-def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Trial]:
-    """In short runs."""
-    first = [trials_of(method, gaussians, "quick")[0] for method in methods]
-    return [Trial("method", name, n_views, settings=one.settings) for name, one in zip(methods, first, strict=True)]
-
-
-def work(trial: Trial) -> float:
-    """A rough number for how long a trial takes, to be compared within one method only."""
-    if trial.method in JOINT:
-        return trial.views * JOINT[trial.method](trial.settings)
-    return work_of(trial.build(), trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
-
-
-@dataclass(frozen=True)
-class Timed:
-    """A trial that is done, and where its time went.
-
-    Attributes:
-        wall: s, from before its process began to after its end.
-        working: s of these that it reconstructed, which grow with the work; the rest is the same for all.
-    """
-
-    trial: Trial
-    wall: float
-    working: float
-
-    @classmethod
-    def of(cls, outcome: Outcome, wall: float) -> Timed:
-        """The times of a trial that has ended; one without figures has 0 s of work."""
-        seconds = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
-        return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
-
-
-def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
-    """How long the trials that are left will take, from those done; None before the first.
-
-    Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
-    a method not yet seen is taken to cost what the others did on average, and one with a time to take it.
-    """
-    if not done:
-        return None
-    fixed = sum(one.wall - one.working for one in done) / len(done)
-    typical = sum(one.working for one in done) / len(done)
-    total = 0.0
-    for trial in left:
-        if trial.seconds_asked is not None:
-            total += fixed + trial.seconds_asked
-            continue
-        same = [one for one in done if one.trial.method == trial.method and one.working > 0]
-        amount = sum(work(one.trial) for one in same)
-        total += fixed + (work(trial) * sum(one.working for one in same) / amount if amount > 0 else typical)
-    return total

@@ -1,4 +1,4 @@
-"""The studies and their registry: each plans which views of a scan its rows reconstruct; pure values."""
+"""The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _APART = 0.25  # px between views of a window: a mean of views that lie further 
 
 
 @dataclass(frozen=True, eq=False)
-class StudyRow:
-    """One selection of views.
+class ViewChoice:
+    """A choice of views, each the mean of some views of the scan.
 
     Attributes:
         label: in tables.
         groups: int64 [view, window]: each view is the mean of these views of the scan; None: left out.
-        family: rows of the same family are draws of the same choice; empty: the row stands alone.
+        family: choices of the same family are draws of the same kind; empty: it stands alone.
         reason: why it is left out.
     """
 
@@ -83,36 +83,36 @@ class Study:
     name: str
     title: str
     question: str
-    rows: Callable[[ViewSet], Sequence[StudyRow]]
+    rows: Callable[[ViewSet], Sequence[ViewChoice]]
 
 
-def fixed_views(views: ViewSet) -> list[StudyRow]:
+def fixed_views(views: ViewSet) -> list[ViewChoice]:
     """Falling numbers of views, evenly spread."""
     return [_fixed(views, n) for n in COUNTS]
 
 
-def sector(views: ViewSet) -> list[StudyRow]:
+def sector(views: ViewSet) -> list[ViewChoice]:
     """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
     falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
     equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, own in SECTORS if n != own]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
 
 
-def random(views: ViewSet) -> list[StudyRow]:
+def random(views: ViewSet) -> list[ViewChoice]:
     """Falling numbers of views, evenly spread and drawn at random."""
     rows = []
     for n in COUNTS:
         rows.append(_fixed(views, n))
         family = f"random, {n} views"
         if n == views.angles.size:
-            rows.append(StudyRow(family, None, family, "these are all views of the scan: nothing to draw"))
+            rows.append(ViewChoice(family, None, family, "these are all views of the scan: nothing to draw"))
             continue
         for k in range(views.draws if n < views.angles.size else 1):
             rows.append(_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family))
     return rows
 
 
-def window_average(views: ViewSet) -> list[StudyRow]:
+def window_average(views: ViewSet) -> list[ViewChoice]:
     """Means of neighbouring views, in windows that do not overlap, then in overlapping ones; single views first."""
     single = [_fixed(views, n) for n in (OVERLAPPING, 90, 60)]
     disjoint = [_windows(views, width, None) for width in DISJOINT_DEG]
@@ -130,47 +130,26 @@ STUDIES = {
 }
 
 
-def averaged(
-    projections: NDArray[np.float32], angles: NDArray[np.float64], groups: I64
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """The views of a row: line integrals [view, row, col] and their mean angles [view].
-
-    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms.
-
-    Args:
-        projections, angles: of the scan.
-        groups: [view, window].
-    """
-    if groups.shape[1] == 1:
-        return np.asarray(projections[groups[:, 0]], np.float32), angles[groups[:, 0]]
-    out = np.empty((groups.shape[0], *projections.shape[1:]), np.float32)
-    for mean, group in zip(out, groups, strict=True):
-        part = np.asarray(projections[group])
-        least = part.min(axis=0)  # taken out before the exponential, which would be 0 behind much matter
-        mean[:] = least - np.log(np.exp(least - part).mean(axis=0))
-    return out, angles[groups].mean(axis=1)
-
-
-def _fixed(views: ViewSet, n: int) -> StudyRow:
+def _fixed(views: ViewSet, n: int) -> ViewChoice:
     return _chosen(f"fixed, {n} views", f"fixed:{n}", views)
 
 
-def _sector(views: ViewSet, low: int, high: int, n: int) -> StudyRow:
+def _sector(views: ViewSet, low: int, high: int, n: int) -> ViewChoice:
     # A view and its mirror image half a turn apart see the same rays: a scan that begins at -90 degrees has them all.
     return _chosen(f"sector {low}-{high}°, {n} views", f"sector:{low}-{high}:{n}", views, within=True)
 
 
-def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> StudyRow:
+def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> ViewChoice:
     """The row of a selection in the words of `parse_views`; `within`: its angles are those within a period."""
     angles = np.mod(views.angles, views.period) if within else views.angles
     try:
         found = parse_views(spec, angles, period=views.period)
     except ValueError as error:
-        return StudyRow(label, None, family, str(error))
-    return StudyRow(label, found[:, None], family)
+        return ViewChoice(label, None, family, str(error))
+    return ViewChoice(label, found[:, None], family)
 
 
-def _windows(views: ViewSet, width: float, count: int | None) -> StudyRow:
+def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     """Means over `width` degrees: `count` windows evenly spread, or as many as do not overlap (None)."""
     turn = 2 * np.pi
     angles = views.angles if np.ptp(views.angles) < turn else np.mod(views.angles, turn)
@@ -180,22 +159,22 @@ def _windows(views: ViewSet, width: float, count: int | None) -> StudyRow:
     kind = "side by side" if count is None else f"overlapping, {count} views"
     label = f"mean of {w} ({width:g}°), {kind}"
     if w < 2:
-        return StudyRow(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
+        return ViewChoice(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
     room = order.size - w + 1
     n = order.size // w if count is None else count
     if n < 2 or n > room:
-        return StudyRow(
+        return ViewChoice(
             label, None, reason=f"asks for {max(n, 2)} windows of {w}; the {order.size} views hold {max(room, 0)}"
         )
     starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
     groups = order[starts[:, None] + np.arange(w)]
     together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
     if together.sum() < 2:
-        return StudyRow(label, None, reason="the scan's views are too unevenly spread to have neighbours")
+        return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
     groups = groups[together].astype(np.int64)
     apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
     if apart > _APART:
-        return StudyRow(
+        return ViewChoice(
             label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
         )
-    return StudyRow(label, groups)
+    return ViewChoice(label, groups)

@@ -31,9 +31,8 @@ from beamline.core.process import at_end_of
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.trials.data import Data, geometry_in, write_array
-from beamline.trials.joint import VolumeAt, by_parts, jointly, toy_like
+from beamline.trials.joint import VolumeAt, by_parts
 from beamline.trials.trial import Trial
-from beamline.trials.varied import JOINT
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
@@ -71,9 +70,12 @@ def run(
         ValueError: the reconstruction refuses these settings.
         DataError: the disk did not take the volume.
     """
-    views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
-    projections, geometry = data.projections[views], data.geometry.select(views)
-    use = _of_views(DataUse(data.weights, emission=data.emission), views, geometry)
+    if trial.choice is not None:
+        projections, geometry, use = data.chosen(trial.choice)
+    else:
+        views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
+        projections, geometry = data.projections[views], data.geometry.select(views)
+        use = _of_views(DataUse(data.weights, emission=data.emission), views, geometry)
     seen, unseen_rays = use, data.rays_held_out
     if use.weights is not None and unseen_rays is not None:
         seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
@@ -81,7 +83,7 @@ def run(
     ready(trial, data.geometry)
     reset_peak_memory()
     before, began = cpu(), now()
-    if trial.parts > 1 or trial.method in JOINT:
+    if trial.parts > 1 or trial.joint is not None:
         volume_at = _several(trial, data, grid, seed)
     else:
         control = ended_in_time(trial, now, _progress(say, now))
@@ -92,7 +94,7 @@ def run(
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
-    found, left = _measured(volume_at, data, grid, keep)
+    found, left = measured(volume_at, data, grid, keep)
     if trial.halves and trial.views >= 4:
         found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
     return {
@@ -109,7 +111,7 @@ def run(
     }
 
 
-def _measured(volume_at: VolumeAt, data: Data, grid: Grid, keep: Path | None) -> tuple[dict[str, float], list[float]]:
+def measured(volume_at: VolumeAt, data: Data, grid: Grid, keep: Path | None) -> tuple[dict[str, float], list[float]]:
     """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
     n, found, left = data.geometry.n_views, dict[str, float](), list[float]()
     middle = volume_at(float(np.sort(data.shown[:n])[n // 2]))
@@ -119,6 +121,11 @@ def _measured(volume_at: VolumeAt, data: Data, grid: Grid, keep: Path | None) ->
         found = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
         if data.emission is not None:
             found |= metrics.contrast(data.truth, middle)
+    if data.reference is not None:
+        found["psnr_fbp"] = metrics.psnr(data.reference, middle)
+        found["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
+    if data.regions is not None:
+        found["snr"], found["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
     if data.held_out is not None:
         unseen, geometry = data.held_out
         root = np.float32(1) if data.rays_held_out is None else np.sqrt(data.rays_held_out)
@@ -141,24 +148,23 @@ def ready(trial: Trial, geometry: Geometry) -> None:
     Raises:
         ValueError: the method does not take such views.
     """
-    if trial.method in JOINT:
-        series = {"volumes": 2, "motion": "none" if trial.settings.get("motion") == "none" else "learnt"}
-        settings = series if "volumes" in trial.settings else trial.settings
-        jointly(replace(trial, settings=settings), toy_like(geometry, trial), 0, tv_weight=0.1, sweeps=1)
+    if (fit := trial.joint) is not None:
+        toy = fit.toy()
+        toy.fit(toy.toy_data(geometry), 0, tv_weight=0.1, sweeps=1)
     else:
         warm_up(trial.build(), geometry)
 
 
 def _several(trial: Trial, data: Data, grid: Grid, seed: int) -> VolumeAt:
-    if trial.method in JOINT:
-        return jointly(trial, data, seed)
+    if (joint := trial.joint) is not None:
+        return joint.fit(data, seed)
 
     def fit(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
         use = DataUse(weights)
         control = ended_in_time(trial)
         return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, control, use).volume, grid).data
 
-    return by_parts(trial, data, fit)
+    return by_parts(trial.parts, data, fit)
 
 
 def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
@@ -280,7 +286,8 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
 def main(job: Path) -> int:
     """Run the job in the file `job`.
 
-    That is {"data": .npz, "trial": {...}, "seed": n, "keep": .npy or null}, or {"data": .npz, "compile": [{...}, ...]}.
+    That is {"data": folder, "trial": {...}, "seed": n, "keep": .npy or null}, or
+    {"data": folder, "compile": [{...}, ...]}.
     """
 
     def say(line: Mapping[str, Any]) -> None:
@@ -291,9 +298,9 @@ def main(job: Path) -> int:
         geometry = geometry_in(Path(request["data"]))
         for trial in request["compile"]:
             with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                ready(Trial(**trial), geometry)
+                ready(Trial.of_job(trial), geometry)
         return 0
-    trial = Trial(**request["trial"])
+    trial = Trial.of_job(request["trial"])
     keep = request.get("keep")
     try:
         data = Data.load(Path(request["data"]))

@@ -11,8 +11,9 @@ import pytest
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Event
+from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode

@@ -23,7 +23,7 @@ from beamline.core.stop import StopRequest
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct.follow import follow
-from beamline.reconstruct.growing import ScanFollower
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.scan.live_process import follow_command

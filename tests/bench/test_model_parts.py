@@ -20,7 +20,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
-from recon.voxels.held_out_weight import split_views
+from recon.voxels.held_out import split_views
 from recon.voxels.projector import Projector
 from tests.recon.prep.ring_score import ring_score
 

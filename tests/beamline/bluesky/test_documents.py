@@ -9,6 +9,7 @@ import pytest
 
 from beamline.bluesky.documents import Documents
 from beamline.core.events import Failed, FrameStored, RunDone, RunStarted, ScanDone
+from beamline.core.run_result import RunResult
 from tests.beamline.ran import small
 
 pytest.importorskip("event_model")
@@ -17,8 +18,12 @@ STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "battery", 60, 1.0,
 FRAME = FrameStored(20, 60, "projection", 1.0, 1.0, 1.0)
 
 
+def _result(status: str, n: int) -> RunResult:
+    return RunResult(Path("runs/a/scan.h5"), n, [], {}, 0, 0, 0, [], 1.0, 1, None, status)
+
+
 def _done(status: str, n: int) -> ScanDone:
-    return ScanDone(Path("runs/a/scan.h5"), n, [], {}, 0, 0, 0, [], 1.0, 1, None, status)
+    return ScanDone(_result(status, n))
 
 
 def _told(*events: Any) -> list[tuple[str, Any]]:
@@ -37,7 +42,7 @@ def test_a_datum_names_only_rows_that_are_flushed() -> None:
 
 def test_the_live_reconstruction_does_not_end_the_run() -> None:
     of_recon = Failed("too little memory", 5, source="recon")
-    told = _told(STARTED, of_recon, FRAME, _done("complete", 60), RunDone(Path("runs/a"), {}))
+    told = _told(STARTED, of_recon, FRAME, _done("complete", 60), RunDone(Path("runs/a"), _result("complete", 60)))
     assert [name for name, _ in told].count("stop") == 1 and told[-1][0] == "stop"
     assert told[-1][1]["num_events"] == {"primary": 60}
 

@@ -23,8 +23,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from beamline.trials import study as study_run
-from beamline.trials import tradeoff as tradeoff_run
+from beamline.trials import runner
 from beamline.trials.data import write_array
 from beamline.trials.trial import Outcome, Trial
 
@@ -41,7 +40,7 @@ _MODULES = {
     "recon": "cli.recon reconstruct.finished reconstruct.recon_report report.figures",
     "segment": "cli.segment",
     "tradeoff": "cli.tradeoff trials.tradeoff",
-    "study": "cli.study trials.study trials.study_figures",
+    "study": "cli.study trials.study trials.figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 
@@ -105,9 +104,8 @@ def main() -> None:
     cli = import_module("beamline.cli.main")
     for module in _MODULES[command[0]].split():  # once, before the forks
         import_module(f"beamline.{module}")
-    for module in (tradeoff_run, study_run):
-        module.run_trial = _made_up
-        module.compile_kernels = lambda *_: None
+    runner.run_trial = _made_up
+    runner.compile_kernels = lambda *_: None
     os.chdir(folder)
     out, counted, writes = Path("out"), Path("count"), 0
 

@@ -19,6 +19,8 @@ from beamline.core.events import (
     StateEntered,
     Warned,
 )
+from beamline.core.flag import Flag, Level
+from beamline.core.run_result import RunResult
 from beamline.epics.ioc import RunValues, Severity, Stamp, StampedValues
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
@@ -55,13 +57,13 @@ def test_a_state_of_the_live_volume_is_not_that_of_the_scan() -> None:
 
 @pytest.mark.parametrize(("level", "warnings", "alarms"), [("info", 0, 0), ("warn", 1, 0), ("alarm", 0, 1)])
 def test_flags_are_counted_by_level(level: str, warnings: int, alarms: int) -> None:
-    now = _after(FrameFlagged("beam", level, 12, 0.5, 0.1, "look at the shutter", None, None))
+    now = _after(FrameFlagged(Flag("beam", Level(level), 12, 0.5, 0.1, "look at the shutter")))
     assert (now.warnings, now.alarms) == (warnings, alarms)
     assert now.last_flag == f"beam {level}, frame 12: look at the shutter"
 
 
 def test_the_end_leaves_no_rate() -> None:
-    done = ScanDone(Path("a"), 20, [], {}, 0, 0, 0, [], 60.0, 1000, None, "complete")
+    done = ScanDone(RunResult(Path("a"), 20, [], {}, 0, 0, 0, [], 60.0, 1000, None, "complete"))
     now = _after(STARTED, FRAME, done)
     assert math.isnan(now.rate) and now.time_left == 0
 
@@ -100,9 +102,9 @@ def test_a_frame_with_the_same_rate_is_a_newer_value() -> None:
         (StateEntered("failed", ""), "state", Severity.MAJOR),
         (Warned("the beam is low"), "message", Severity.MINOR),
         (Failed("the stage does not answer", 3, Path("runs/a")), "message", Severity.MAJOR),
-        (FrameFlagged("beam", "info", 1, 0.5, 0.1, "", None, None), "last_flag", Severity.NO_ALARM),
-        (FrameFlagged("beam", "warn", 1, 0.5, 0.1, "", None, None), "warnings", Severity.MINOR),
-        (FrameFlagged("beam", "alarm", 1, 0.5, 0.1, "", None, None), "alarms", Severity.MAJOR),
+        (FrameFlagged(Flag("beam", Level("info"), 1, 0.5, 0.1, "")), "last_flag", Severity.NO_ALARM),
+        (FrameFlagged(Flag("beam", Level("warn"), 1, 0.5, 0.1, "")), "warnings", Severity.MINOR),
+        (FrameFlagged(Flag("beam", Level("alarm"), 1, 0.5, 0.1, "")), "alarms", Severity.MAJOR),
         (FRAME, "rate", Severity.NO_ALARM),
     ],
 )

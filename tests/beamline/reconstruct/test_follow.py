@@ -17,11 +17,13 @@ import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError
 from beamline.core.events import Event
+from beamline.core.sinks import Warnings
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct import growing as module
+from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
 from beamline.reconstruct.follow import follow
+from beamline.reconstruct.live_fit import FollowState, ScanFollower
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
@@ -340,3 +342,43 @@ def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
     volume: Volume = read_reconstruction(tmp_path / "recon.h5").volume
     assert volume.grid.shape == (1, 20, 20)
     assert volume.grid.voxel_size == pytest.approx(1.0)
+
+
+def _follower(folder: Path, clock: ScanClock, frames: list[Frame]) -> tuple[ScanFollower, list[Event]]:
+    """Of a file that takes a frame a second, without an axis."""
+    events: list[Event] = []
+    schedule(clock, folder / "scan.h5", [replace(f, index=i) for i, f in enumerate(frames)], period=1.0)
+    clock.sleep(1.0)
+    wanted = options(folder, selection=Selection())
+    source = wanted.source.open(follow=True)
+    return ScanFollower(wanted, source, events.append, clock, Warnings(events.append, clock)), events
+
+
+def test_it_waits_for_references_then_for_the_axis_then_feeds(tmp_path: Path) -> None:
+    clock, frames = ScanClock(), frames_of(INTERLACED)
+    follower, _ = _follower(tmp_path, clock, frames)
+    states = []
+    with follower.source:
+        for n in (4, 1, 29):  # references, the first view, the others
+            clock.sleep(n)
+            assert follower.take_new_frames(False)
+            states.append((follower.state, follower.n_views_taken))
+        assert follower.axis_col == pytest.approx(SCAN.axis_col, abs=0.5)
+    close(clock)
+    assert states == [
+        (FollowState.WAITS_FOR_REFERENCES, 0), (FollowState.WAITS_FOR_AXIS, 0), (FollowState.FEEDS, 30)
+    ]  # fmt: skip
+
+
+def test_references_that_follow_the_views_are_waited_for_until_the_scan_has_ended(tmp_path: Path) -> None:
+    clock, frames = ScanClock(), frames_of(INTERLACED)
+    follower, events = _follower(tmp_path, clock, [*frames[4:], *frames[:4]])
+    with follower.source:
+        for _ in range(2):
+            clock.sleep(20.0)
+            follower.take_new_frames(False)
+            assert follower.state is FollowState.WAITS_FOR_REFERENCES
+        assert [event.data["state"] for event in events] == ["waiting"]
+        follower.take_new_frames(True)
+        assert follower.state is FollowState.FEEDS and follower.n_views_taken == 30
+    close(clock)

@@ -19,7 +19,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct.follow import follow
-from beamline.reconstruct.growing import ScanFollower
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter

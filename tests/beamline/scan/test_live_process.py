@@ -13,12 +13,13 @@ import pytest
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
+from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import live_process
 from beamline.scan import run as module
 from beamline.scan.live_plan import LivePlan
 from beamline.scan.live_process import LiveReconstruction, follow_command
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
 

@@ -14,11 +14,12 @@ import pytest
 
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Event
+from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.instrument import connect as devices
 from beamline.scan.align import _blocks
 from beamline.scan.ledger import LedgerError
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.scan.tune import take
 from beamline.storage.rules.validate import validate
 from drivers.base.clock import Clock

@@ -16,6 +16,7 @@ import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.files import parts_of
+from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.flags import Flags
@@ -26,7 +27,7 @@ from beamline.projections.selection import Selection
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.scan.states import State
 from beamline.storage.describe import describe
 from beamline.storage.hdf5 import open_hdf5

@@ -9,8 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from beamline.trials import figures as tradeoff_figures
-from beamline.trials.figures import cost_curves, pareto_plot
+from beamline.trials.figures import colour_of, cost_curves, pareto_plot
 from beamline.trials.trial import Outcome, Trial
+from recon import methods
 
 FBP, FIT = Trial("method", "fbp", 10), Trial("method", "r2", 10, settings={"steps": 100})
 FEW = Trial("views", "r2", 5, settings={"steps": 100})
@@ -83,3 +84,9 @@ def test_the_trial_that_a_number_names_lies_above_another_at_its_place(drawn: li
         pareto_plot(points, [front], "time (s)", "PSNR (dB)")
         dots = drawn[-1].axes[0].collections[:3]
         assert max(range(3), key=lambda k: dots[k].get_zorder()) == front
+
+
+def test_every_method_has_a_colour_of_its_own_also_one_of_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = (*methods.names(), "theirs", "others")
+    monkeypatch.setattr(tradeoff_figures, "names", lambda: names)
+    assert len({colour_of(name) for name in names}) == len(names)

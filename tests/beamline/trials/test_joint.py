@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,8 +12,9 @@ import pytest
 
 from beamline.trials import joint, worker
 from beamline.trials.data import Data
-from beamline.trials.joint import by_parts, jointly
-from beamline.trials.trial import Trial, plan_in_time, plan_of_energies, work
+from beamline.trials.joint import MaterialsFit, SeriesFit, by_parts
+from beamline.trials.plans import plan_in_time, plan_of_energies, work
+from beamline.trials.trial import Trial
 from beamline.trials.worker import main, ready, run, shown
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
@@ -82,7 +83,7 @@ def test_parts_in_time_are_linear_between_their_middles(in_time: Data) -> None:
         in_time, projections=in_time.projections[order], geometry=in_time.geometry.select(order),
         of_view=np.concatenate((in_time.shown[:VIEWS][order], in_time.shown[VIEWS:])),
     )  # fmt: skip
-    volume_at = by_parts(replace(SERIES, parts=2), mixed, plain_fbp)
+    volume_at = by_parts(2, mixed, plain_fbp)
     halves = [np.sort(np.argsort(mixed.shown[:VIEWS])[half]) for half in (slice(0, 20), slice(20, 40))]
     first, last = (fbp(mixed.projections[half], mixed.geometry.select(half)) for half in halves)
     early, late = (mixed.shown[:VIEWS][half].mean() for half in halves)
@@ -91,7 +92,7 @@ def test_parts_in_time_are_linear_between_their_middles(in_time: Data) -> None:
 
 
 def test_parts_of_energies_are_one_an_energy(of_energies: Data) -> None:
-    volume_at = by_parts(replace(MATERIALS, parts=2), of_energies, plain_fbp)
+    volume_at = by_parts(2, of_energies, plain_fbp)
     for energy in (0, 1):
         own = np.flatnonzero(of_energies.shown[:VIEWS] == energy)
         expected = fbp(of_energies.projections[own], of_energies.geometry.select(own))
@@ -101,13 +102,13 @@ def test_parts_of_energies_are_one_an_energy(of_energies: Data) -> None:
 def test_one_fit_in_time_is_that_of_recon(in_time: Data) -> None:
     views = TimedViews(in_time.projections, in_time.geometry, in_time.shown[:VIEWS])
     expected = short_series(views, 2, motion=False)
-    np.testing.assert_array_equal(jointly(SERIES, in_time, 0)(3.0), expected.at(3.0))
+    np.testing.assert_array_equal(SeriesFit(2, "none").fit(in_time, 0)(3.0), expected.at(3.0))
 
 
 def test_one_fit_of_energies_is_that_of_recon(of_energies: Data) -> None:
     energy = of_energies.shown[:VIEWS].astype(np.intp)
     made = fit_materials(EnergyViews(of_energies.projections, of_energies.geometry, energy, SECTIONS))
-    at = jointly(MATERIALS, of_energies, 0)(1.0)
+    at = MaterialsFit().fit(of_energies, 0)(1.0)
     np.testing.assert_allclose(at, SECTIONS[1, 0] * made.densities[0] + SECTIONS[1, 1] * made.densities[1], rtol=1e-5)
 
 
@@ -157,18 +158,18 @@ def test_a_share_of_states_is_explained_from_few_views(of_energies: Data) -> Non
 def test_a_trial_keeps_what_the_middle_view_shows(in_time: Data, tmp_path: Path) -> None:
     run(SERIES, in_time, 0, print, keep=tmp_path / "volume.npy")
     middle = np.sort(in_time.shown[:VIEWS])[VIEWS // 2]
-    np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), jointly(SERIES, in_time, 0)(float(middle)))
+    np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), SeriesFit(2, "none").fit(in_time, 0)(float(middle)))
 
 
 def test_times_and_energies_come_through_the_file(
     of_energies: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    of_energies.save(tmp_path / "data.npz")
-    back = Data.load(tmp_path / "data.npz")
+    of_energies.save(tmp_path / "data")
+    back = Data.load(tmp_path / "data")
     assert back.states == (0, 1) and back.sections is not None
     np.testing.assert_array_equal(back.sections, SECTIONS)
     np.testing.assert_array_equal(back.shown, of_energies.shown)
-    job = {"data": str(tmp_path / "data.npz"), "trial": asdict(MATERIALS), "seed": 0}
+    job = {"data": str(tmp_path / "data"), "trial": MATERIALS.as_job(), "seed": 0}
     (tmp_path / "job.json").write_text(json.dumps(job))
     assert main(tmp_path / "job.json") == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -176,11 +177,9 @@ def test_times_and_energies_come_through_the_file(
 
 
 def test_too_few_views_are_a_failed_trial(in_time: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    in_time.save(tmp_path / "data.npz")
+    in_time.save(tmp_path / "data")
     trial = replace(SERIES, settings={"volumes": 9, "motion": "none"})
-    (tmp_path / "job.json").write_text(
-        json.dumps({"data": str(tmp_path / "data.npz"), "trial": asdict(trial), "seed": 0})
-    )
+    (tmp_path / "job.json").write_text(json.dumps({"data": str(tmp_path / "data"), "trial": trial.as_job(), "seed": 0}))
     assert main(tmp_path / "job.json") == 1
     assert "9 volumes of 40 views" in json.loads(capsys.readouterr().out.splitlines()[-1])["message"]
 
@@ -188,7 +187,7 @@ def test_too_few_views_are_a_failed_trial(in_time: Data, tmp_path: Path, capsys:
 @pytest.mark.parametrize("how", ["none", "learnt", "chosen"])
 def test_compiling_takes_a_toy_of_the_same_trial(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     toys: list[Data] = []
-    monkeypatch.setattr(worker, "jointly", lambda trial, data, seed, **given: toys.append(data))
+    monkeypatch.setattr(SeriesFit, "fit", lambda self, data, seed, **given: toys.append(data))
     cone = Geometry.cone(np.linspace(0, 6, 9), (30, 40), 1.0, 60.0, 120.0)
     ready(replace(SERIES, settings={"volumes": 5, "motion": how}), cone)
     assert toys[0].geometry.is_cone and toys[0].geometry.detector_shape < (30, 40)

@@ -14,7 +14,8 @@ from beamline.core.errors import DataError
 from beamline.trials import launch as trial_run
 from beamline.trials.data import Data
 from beamline.trials.launch import compile_kernels, run_trial
-from beamline.trials.trial import Trial, plan
+from beamline.trials.plans import plan
+from beamline.trials.trial import Trial
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.scans import TwoCylinders
@@ -64,7 +65,7 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
         ("fbp", "", "", ""), ("r2", "", "", ""), ("r2", "", "", "gaussian"), ("r2", "", "l2", ""),
         ("r2", "", "poisson", ""), ("r2", "tv", "", ""), ("sirt", "", "", ""),
     ]  # fmt: skip
-    assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
+    assert job["data"] == str(tmp_path / "data")  # whose geometry decides which kernels are used
 
 
 @pytest.mark.slow
@@ -72,7 +73,7 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
     views = Geometry.parallel(SCAN.angles, SCAN.shape)
     data = Data(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
-    data.save(tmp_path / "data.npz")
+    data.save(tmp_path / "data")
     ballast = np.ones(90_000_000)  # 720 MB
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
     assert outcome.status == "done", outcome.message

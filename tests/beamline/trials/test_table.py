@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.core.machine import machine
-from beamline.trials.report import conclusions
+from beamline.trials.front import conclusions
 from beamline.trials.table import LEAST_GAIN, MEMORY, TIME, TrialTable
 from beamline.trials.trial import Outcome, Trial
 

@@ -7,16 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.trials.view_choices import STUDIES, StudyRow, ViewSet, averaged
+from beamline.trials.data import averaged
+from beamline.trials.view_choices import STUDIES, ViewChoice, ViewSet
 
 HALF_TURN = np.radians(np.arange(1800) * 0.1)
 
 
-def rows(name: str, angles: np.ndarray = HALF_TURN, draws: int = 3) -> dict[str, StudyRow]:
+def rows(name: str, angles: np.ndarray = HALF_TURN, draws: int = 3) -> dict[str, ViewChoice]:
     return {row.label: row for row in STUDIES[name].rows(ViewSet(angles, np.pi, draws=draws))}
 
 
-def degrees(row: StudyRow, angles: np.ndarray = HALF_TURN) -> np.ndarray:
+def degrees(row: ViewChoice, angles: np.ndarray = HALF_TURN) -> np.ndarray:
     assert row.groups is not None
     return np.degrees(angles[row.groups[:, 0]])
 
@@ -118,6 +119,6 @@ def test_a_mean_of_views_is_that_of_their_light(window: int, offset: float) -> N
 
 
 def test_a_frame_that_several_views_share_is_dose_once() -> None:
-    row = StudyRow("overlapping", np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]]))
+    row = ViewChoice("overlapping", np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]]))
     assert (row.n_views, row.window, row.frames) == (3, 3, 5)
-    assert StudyRow("left out", None, reason="too few").frames == 0
+    assert ViewChoice("left out", None, reason="too few").frames == 0

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from beamline.config.load import Config, config_folder, load
+from beamline.core.run_result import RunResult
 from beamline.scan import recorder
 from beamline.scan.ledger import LedgerError
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import FrameKind

@@ -24,12 +24,13 @@ import serial
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Event, Sink
+from beamline.core.run_result import RunResult
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.scan import run as run_module
 from beamline.scan.control import verbs_taken
 from beamline.scan.recorder import Recorder
-from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind

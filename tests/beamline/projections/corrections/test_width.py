@@ -16,7 +16,7 @@ from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepDone, options_of
-from beamline.reconstruct.growing import ScanFollower
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.simulate.scene_file import Scan, open_scene

@@ -14,9 +14,11 @@ import pytest
 from beamline.core.machine import machine
 from beamline.report.html import Picture
 from beamline.report.slice_sheet import SliceSheet
-from beamline.trials.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
+from beamline.trials.front import TRADEOFF, conclusions
+from beamline.trials.layout import finite, text, to_csv, to_html, write_page, write_table
+from beamline.trials.plans import plan, plan_in_equal_time
 from beamline.trials.table import TrialTable
-from beamline.trials.trial import Outcome, Trial, plan, plan_in_equal_time
+from beamline.trials.trial import Outcome, Trial
 from recon.methods import names
 from tests.beamline.html_page import parsed_page
 
@@ -47,7 +49,7 @@ def test_the_table_fits_into_120_columns(kind: str) -> None:
         Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4, reached="12345 iterations")
         for trial in planned[kind]
     )
-    said = text(TrialTable(outcomes, "psnr", "mm", machine(), {}, ""))
+    said = text(TrialTable(outcomes, "psnr", "mm", machine(), {}, ""), TRADEOFF)
     rows = said.split("\n\n")[1].splitlines()[1:]
     assert len(rows) == len(outcomes)
     assert max(map(len, said.splitlines()[1:])) <= 120  # the first line is the machine's
@@ -74,25 +76,25 @@ def test_a_held_out_residual_is_told_in_decibels_below_the_data() -> None:
     table = _table(judged, by="residual_held_out")
     assert table.qualities == [pytest.approx(20.0)]
     assert "−20 log₁₀ of the held-out residual" in conclusions(table)[0]
-    row = next(line for line in text(table).splitlines() if line.startswith("* fbp"))
+    row = next(line for line in text(table, TRADEOFF).splitlines() if line.startswith("* fbp"))
     assert row.split()[-4:] == ["1.00", "n/a", "n/a", "0.1000"]  # s, CPU s, MB, residual: two are not known
 
 
 def test_csv_and_json_hold_what_was_measured_and_nothing_where_nothing_was(tmp_path: Path) -> None:
     table = _table(_done(BASE, 2.0, math.inf), Outcome(FIT, "failed", message='no "room", said\nthe system'))
-    first, second = csv.DictReader(io.StringIO(to_csv(table)))
+    first, second = csv.DictReader(io.StringIO(to_csv(table, TRADEOFF)))
     assert (first["seconds"], first["psnr"], first["ssim3d"], first["steps"]) == ("2.0", "", "0.5", "")
     assert (second["status"], second["seconds"], second["gaussians"]) == ("failed", "", "2000")
     assert second["message"] == 'no "room", said\nthe system'
-    write_table(tmp_path, table)
+    write_table(tmp_path, table, TRADEOFF)
     record = json.loads((tmp_path / "tradeoff.json").read_text(encoding="utf-8"))
     assert [trial["metrics"].get("psnr") for trial in record["trials"]] == [None, None]
     assert record["trials"][1]["trial"]["label"] == FIT.label
-    assert (tmp_path / "tradeoff.csv").read_text(encoding="utf-8") == to_csv(table)
+    assert (tmp_path / "tradeoff.csv").read_text(encoding="utf-8") == to_csv(table, TRADEOFF)
 
 
 def test_the_page_shows_words_of_others_as_words() -> None:
-    page = to_html(_table(_done(BASE, 2.0, 20.0), Outcome(FIT, "failed", message="<script>")), [])
+    page = to_html(_table(_done(BASE, 2.0, 20.0), Outcome(FIT, "failed", message="<script>")), TRADEOFF, [])
     assert "<script>" not in page and "&lt;script&gt;" in page
     assert "a <b>" not in page and "a &lt;b&gt;.h5" in page
     assert f"<strong>{BASE.label}</strong>" in page and f"<strong>{FIT.label}" not in page
@@ -102,7 +104,7 @@ def test_the_page_shows_words_of_others_as_words() -> None:
 def test_the_page_has_every_part_and_requests_nothing() -> None:
     done = _done(BASE, 2.0, 20.0)
     table = _table(done, Outcome(FIT, "failed", message="no room"))
-    parsed = parsed_page(to_html(table, [Picture("Quality", "A <caption>", b"\x89PNG")]))
+    parsed = parsed_page(to_html(table, TRADEOFF, [Picture("Quality", "A <caption>", b"\x89PNG")]))
     text = " ".join("".join(parsed.text).split())
     assert all(line in text for line in conclusions(table))
     for part in ("What accuracy costs", "PSNR (dB)", BASE.label, "2.00", "failed: no room", "A <caption>", "a <b>.h5"):
@@ -111,11 +113,14 @@ def test_the_page_has_every_part_and_requests_nothing() -> None:
 
 
 def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
-    write_figures(tmp_path, _table(Outcome(BASE, "failed")), SliceSheet())
+    write_page(tmp_path, _table(Outcome(BASE, "failed")), TRADEOFF, SliceSheet())
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html"}
     curve = ((0.1, 3.0), (0.2, 4.0))
-    write_figures(
-        tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")), SliceSheet()
+    write_page(
+        tmp_path,
+        _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")),
+        TRADEOFF,
+        SliceSheet(),
     )
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html", "quality_seconds.png", "curves.png"}
 

@@ -1,9 +1,18 @@
-"""A growing scan: the frames taken so far, the axis by these views, and the fit that they feed."""
+"""The live fit: a machine of four states that turns the frames of a growing scan into a volume.
+
+```
+WAITS_FOR_REFERENCES --darks and flats can be used--> WAITS_FOR_AXIS --its column is known--> FEEDS --finish--> ENDED
+```
+
+Each look at the file goes as far as it can: with the first view it may pass two states, and feed a batch. `Cursor` says
+how far the fit has come in the file.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,21 +59,61 @@ _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected 
 _SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
+class FollowState(Enum):
+    """What the fit of a growing scan waits for, or does."""
+
+    WAITS_FOR_REFERENCES = auto()
+    WAITS_FOR_AXIS = auto()
+    FEEDS = auto()
+    ENDED = auto()
+
+
+@dataclass(frozen=True, eq=False)
+class Cursor:
+    """How far the fit has come in the file.
+
+    Attributes:
+        frames: in the file at the last look.
+        taken: of them, those that were corrected, or are not views.
+        part: of the file, whose views were corrected last.
+        batches: line integrals of the views that are corrected for good: what the volume grows from.
+        newest: the view after them, provisional: it is in the fit already, and is corrected again with the next one.
+    """
+
+    frames: int = 0
+    taken: int = 0
+    part: int = 0
+    batches: tuple[Projections, ...] = ()
+    newest: Projections | None = None
+
+    @property
+    def behind(self) -> bool:
+        """The file has frames that were not taken yet."""
+        return self.taken < self.frames
+
+    @property
+    def n_corrected(self) -> int:
+        """Views in `batches`."""
+        return sum(batch.view_ids.size for batch in self.batches)
+
+    @property
+    def view_ids(self) -> NDArray[np.int64]:
+        """Frames of the file of the views in `batches`."""
+        return np.concatenate([batch.view_ids for batch in self.batches])
+
+
 class ScanFollower:
     """A scan's file and the volume that grows with it. The caller decides when to look, to fit and to finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self.source = source
+        self.state = FollowState.WAITS_FOR_REFERENCES
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self._axis = AxisSearch(source, options.selection, warn)
-        self._correction: ScanCorrection | None = None
-        self._batches: list[Projections] = []  # line integrals of the views taken: what the volume grows from
-        self._newest: Projections | None = None  # in the fit already; corrected again when the next view is there
+        self._cursor = Cursor()
         self._references_follow = False  # darks or flats come after the views
+        self._axis = AxisSearch(source, options.selection, warn)
+        self._correction: ScanCorrection | None = None  # None: waits for references
         self._fit: StreamingFit | None = None
-        self._frames = 0
-        self._taken = 0  # frames that were corrected, or are not views
-        self._file_part = 0  # part of the file whose views were corrected last
         self._history: list[Progress] = []
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
@@ -82,7 +131,7 @@ class ScanFollower:
     @property
     def n_views_taken(self) -> int:
         """Views that have fed the fit."""
-        return sum(batch.view_ids.size for batch in self._batches) + (self._newest is not None)
+        return self._cursor.n_corrected + (self._cursor.newest is not None)
 
     @property
     def has_volume(self) -> bool:
@@ -91,34 +140,71 @@ class ScanFollower:
 
     def take_new_frames(self, ended: bool) -> bool:
         """Look at the file; feed the fit with at most one batch of new views. True if the file has grown."""
+        assert self.state is not FollowState.ENDED
         n = self.source.refresh()
-        grown, self._frames = n > self._frames, n
-        views = self._chosen(usable_views(self.source, self._options.selection.step(Flags).used).frames)
-        if views.size == 0:
-            self._taken = n
-            return grown
-        if self._correction is None:
-            blockers = correction_blockers(self.source, self._options.selection)
-            if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
-                self._wait_for_references()
-                return grown
-            refuse(self.source, blockers)
-            self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
-            self._tell(self._correction.done)
-        if not self._axis.settled:
-            self._settle_axis(self._correction, views, ended)
-        if self.axis_col is None:
-            return grown
+        grown = n > self._cursor.frames
+        views = self._chosen(self._usable().frames)
+        self._cursor = replace(self._cursor, frames=n, taken=self._cursor.taken if views.size else n)
+        if views.size:
+            self._step(views, ended)
+        return grown
+
+    def _step(self, views: NDArray[np.int64], ended: bool) -> None:
+        """Go through the states as far as the views of the file allow, and feed one batch."""
+        if self.state is FollowState.WAITS_FOR_REFERENCES and self._references_are_there(ended):
+            self.state = FollowState.WAITS_FOR_AXIS
+        if self.state is not FollowState.WAITS_FOR_REFERENCES and not self._axis.settled:
+            self._look_for_axis(views, ended)
+        if self.state is FollowState.WAITS_FOR_AXIS and self.axis_col is not None:
+            self.state = FollowState.FEEDS
+        if self.state is FollowState.FEEDS:
+            self._feed_batch(views, ended)
+
+    def _references_are_there(self, ended: bool) -> bool:
+        """Whether darks and flats can be used; if so, the correction begins.
+
+        Those that come after the views are all there when the scan has ended, not before.
+
+        Raises:
+            DataError: the scan has ended, or something else is missing, and nothing will come.
+        """
+        blockers = correction_blockers(self.source, self._options.selection)
+        if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
+            if not self._references_follow:
+                message = "No darks or no flats before the views: the volume begins when the scan has ended"
+                self._sink(StateEntered("waiting", message, time=self._clock.now()))
+            self._references_follow = True
+            return False
+        refuse(self.source, blockers)
+        self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
+        self._tell(self._correction.done)
+        return True
+
+    def _look_for_axis(self, views: NDArray[np.int64], ended: bool) -> None:
+        """Look for the axis. After a large move the fit begins anew with all views; after a small one it goes on."""
+        assert self._correction is not None
+        before = self.axis_col
+        self._axis.look(self._correction, views, ended)
+        if self._fit is None or before is None or self.axis_col is None or self.axis_col == before:
+            return
+        if abs(self.axis_col - before) > _AXIS_MOVES:
+            self._fit = None
+        else:
+            self._fit.move_axis(self._binned(self.axis_col))
+
+    def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
+        """Feed the fit with the next views, all of one part of the file: other parts have references of their own."""
+        assert self.axis_col is not None
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
-        new = views[views >= self._taken]
+        new = views[views >= self._cursor.taken]
         parts = np.searchsorted(self.source.part_starts, new, "right") - 1
-        if new.size and parts[0] != self._file_part:
+        if new.size and parts[0] != self._cursor.part:
             self._begin_part(int(parts[0]))
-        batch = new[parts == parts[:1]][:_BATCH]  # views of one part: other parts are corrected by other references
-        self._feed(batch, last=ended and batch.size == new.size)
-        self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
-        return grown
+        batch = new[parts == parts[:1]][:_BATCH]
+        all_taken = batch.size == new.size
+        self._feed(batch, last=ended and all_taken)
+        self._cursor = replace(self._cursor, taken=self._cursor.frames if all_taken else int(batch[-1]) + 1)
 
     def _begin_part(self, part: int) -> None:
         """Begin a later part of the file: correct its views by its own references.
@@ -126,31 +212,37 @@ class ScanFollower:
         The fit takes in the last view of the part before, which waited for the next, and learns all views again.
         """
         assert self._correction is not None
-        self._file_part = part
-        if self._newest is not None:
-            self._feed(np.empty(0, np.int64), last=True)
-        if self._batches:
-            usable = usable_views(self.source, self._options.selection.step(Flags).used)
-            self._correct_again(usable, _NEXT_PART)
+        self._cursor = replace(self._cursor, part=part)
+        self._settle_newest()
+        if self._cursor.batches:
+            self._correct_again(self._usable(), _NEXT_PART)
         else:
             self._correction = self._correction.renewed()
+
+    def _settle_newest(self) -> None:
+        """Correct the newest view for good: no other comes that it waits for."""
+        if self._cursor.newest is not None:
+            self._feed(np.empty(0, np.int64), last=True)
 
     def _feed(self, frames: NDArray[np.int64], last: bool) -> None:
         """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
         assert self._correction is not None and self._fit is not None
-        batch = self._correction.feed(frames, last=last)
+        batch, newest = self._correction.feed(frames, last=last), self._cursor.newest
         if batch is not None:
-            self._batches.append(batch)
-            data, views, newest = batch.data, batch.view_ids, self._newest
+            data, views = batch.data, batch.view_ids
             if newest is not None:
                 if not np.array_equal(data[0], newest.data[0]):
                     self._fit.replace_newest(data[0])
-                data, views, self._newest = data[1:], views[1:], None
+                data, views, newest = data[1:], views[1:], None
+            self._cursor = replace(self._cursor, batches=(*self._cursor.batches, batch), newest=None)
             if views.size:
                 self._fit.add_views(data, self._angles(views))
-        if self._newest is None and (newest := self._correction.newest()) is not None:
-            self._newest = newest
+        if newest is None and (newest := self._correction.newest()) is not None:
+            self._cursor = replace(self._cursor, newest=newest)
             self._fit.add_views(newest.data, self._angles(newest.view_ids))
+
+    def _usable(self) -> UsableViews:
+        return usable_views(self.source, self._options.selection.step(Flags).used)
 
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """The views of the selection, by their place among all views taken, which later frames do not change."""
@@ -160,29 +252,11 @@ class ScanFollower:
 
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
-        while self._taken < self._frames:
+        while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
                 self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.n_views} views.")
                 return
             self.take_new_frames(ended=True)
-
-    def _wait_for_references(self) -> None:
-        """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""
-        if not self._references_follow:
-            message = "No darks or no flats before the views: the volume begins when the scan has ended"
-            self._sink(StateEntered("waiting", message, time=self._clock.now()))
-        self._references_follow = True
-
-    def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Look for the axis. After a large move the fit begins anew with all views; after a small one it goes on."""
-        before = self.axis_col
-        self._axis.look(correction, views, ended)
-        if self._fit is None or before is None or self.axis_col is None or self.axis_col == before:
-            return
-        if abs(self.axis_col - before) > _AXIS_MOVES:
-            self._fit = None
-        else:
-            self._fit.move_axis(self._binned(self.axis_col))
 
     def _binned(self, axis_col: float) -> float:
         return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
@@ -210,9 +284,9 @@ class ScanFollower:
         now = self._clock.now()
         self._sink(ReconStarted(self.source.path, options.method.name, self.n_views, axis_col, again, time=now))
         fit = options.streaming.stream(template, options.seed, self._clock.now)
-        for batch in self._batches:
+        for batch in self._cursor.batches:
             fit.add_views(batch.data, self._angles(batch.view_ids, axis_col))
-        self._newest = None
+        self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
         return fit
 
     def _correct_again(self, usable: UsableViews, why: str) -> None:
@@ -225,7 +299,7 @@ class ScanFollower:
         again. Then the model goes on without them, at the first rates.
         """
         assert self._correction is not None and self._fit is not None
-        fed = np.concatenate([batch.view_ids for batch in self._batches])
+        fed = self._cursor.view_ids
         frames = fed[np.isin(fed, usable.frames)]
         gone = fed.size - frames.size
         shaded = self._correction.finds_shadow(frames)
@@ -237,9 +311,10 @@ class ScanFollower:
             why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
         self._sink(StateEntered("correcting", why, time=self._clock.now()))
         self._correction = self._correction.renewed()
-        self._batches = []
-        self._batches = [self._correction.at_once(frames)]
-        self._fit.replace_views(self._batches[0].data, self._angles(frames) if gone else None)
+        self._cursor = replace(self._cursor, batches=())  # not both in memory
+        again = self._correction.at_once(frames)
+        self._cursor = replace(self._cursor, batches=(again,))
+        self._fit.replace_views(again.data, self._angles(frames) if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False if there is nothing to fit yet."""
@@ -259,10 +334,10 @@ class ScanFollower:
 
     def ask_whether_enough(self) -> None:
         """With a goal, report the gain by further views, and once that the views so far are enough."""
-        if self._enough is None or sum(batch.view_ids.size for batch in self._batches) < self._enough.next_look:
+        if self._enough is None or self._cursor.n_corrected < self._enough.next_look:
             return
         try:
-            taken = [batch.view_ids for batch in self._batches]
+            taken = [batch.view_ids for batch in self._cursor.batches]
             planned = planned_views(self.source, self._options.selection, self.axis_col, taken)
         except NotPlannedError as error:
             self._warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
@@ -296,8 +371,8 @@ class ScanFollower:
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
-        if self._newest is not None:  # the scan was stopped: no other view comes
-            self._feed(np.empty(0, np.int64), last=True)
+        self.state = FollowState.ENDED
+        self._settle_newest()  # the scan was stopped: no other view comes
         if usable.jumps.size and self._options.selection.step(Jumps).wanted == "correct":
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
@@ -344,9 +419,11 @@ class ScanFollower:
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
-        if len(self._batches) > 1:
-            self._batches = [merge_and_empty(self._batches)]
-        return self._batches[0]
+        batches = list(self._cursor.batches)
+        if len(batches) > 1:
+            self._cursor = replace(self._cursor, batches=())  # each is freed when it has been copied
+            self._cursor = replace(self._cursor, batches=(merge_and_empty(batches),))
+        return self._cursor.batches[0]
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         """All views, now that they are there, after the steps that need all of them."""

@@ -1,0 +1,66 @@
+"""Flag: what a check of the monitor says of a frame; the event `flag` carries it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+PixelBox = tuple[int, int, int, int]
+"""Pixels of a frame: (first row, row after the last, first column, column after the last)."""
+
+
+class Level(StrEnum):
+    INFO = "info"  # a fact about the scan; the frame is not marked in the file
+    WARN = "warn"  # look at it when you have time
+    ALARM = "alarm"  # the data are suffering now
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A check's finding.
+
+    Attributes:
+        check: name of the check.
+        level: how bad.
+        frame: its number in the file, from 0; darks and flats count.
+        score: the measured figure, in the check's unit.
+        limit: the figure that it exceeds.
+        advice: what it means and what to do.
+        region: where in the frame; None: everywhere, or nowhere in particular.
+        first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
+            of its kind, without another between. Where a finding takes still more views, `frame` itself is earlier
+            than the one at which it is found.
+        from_region: where in the frame `first`; what it is of moved straight to `region`. None: `region` in `frame`
+            alone is known.
+    """
+
+    check: str
+    level: Level
+    frame: int
+    score: float
+    limit: float
+    advice: str
+    region: PixelBox | None = None
+    first: int | None = None
+    from_region: PixelBox | None = None
+
+    @property
+    def frames(self) -> range:
+        """Frames of the file that it holds for."""
+        return range(self.frame if self.first is None else self.first, self.frame + 1)
+
+    def regions(self) -> dict[int, PixelBox]:
+        """Where it is in each of its frames in which that is known."""
+        if self.region is None:
+            return {}
+        if self.from_region is None:
+            return {self.frame: self.region}
+        boxes = np.rint(np.linspace(self.from_region, self.region, len(self.frames))).astype(int).tolist()
+        return {frame: tuple(box) for frame, box in zip(self.frames, boxes, strict=True)}
+
+    def told(self) -> dict[str, Any]:
+        """What the event `flag` says, by name."""
+        return {name: value for name, value in vars(self).items() if name != "from_region" or value is not None}

@@ -1,0 +1,200 @@
+"""ReconRecord: what is known of a volume, the same in its file, in the event of its end and in a script."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.voxel_kind import VoxelKind
+from recon.assess.time_model import NextDecibel
+from recon.base.volume import Grid, Volume
+
+Value = str | int | float | bool | NDArray[Any]
+_ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that tell how it ended
+
+
+@dataclass(frozen=True, eq=False)
+class VolumesInTime:
+    """Volumes of a sample that changes.
+
+    Attributes:
+        seconds: float64 [time], from the first view on.
+        data: float32 [time, z, y, x], or a dataset of a file.
+    """
+
+    seconds: NDArray[np.float64]
+    data: Any
+
+    def each(self) -> list[Any]:
+        """The volumes, which are read where they are sliced along z."""
+        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
+
+
+class _VolumeAt:
+    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
+
+    def __init__(self, data: Any, at: int) -> None:
+        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
+
+    def __getitem__(self, z: slice) -> NDArray[np.float32]:
+        return np.asarray(self._data[self._at, z])
+
+
+@dataclass(frozen=True, eq=False)
+class VolumeInFile:
+    """A volume whose voxels are in a file alone: its grid, and what reads it."""
+
+    grid: Grid
+    read: Callable[[], Volume]
+
+
+class VolumeField:
+    """A field of a dataclass that holds a volume, or one in a file, which is read at the first use."""
+
+    def __get__(self, record: Any, owner: type | None = None) -> Volume:
+        if record is None:
+            raise AttributeError("a field without a default")
+        held = record.__dict__["volume"]
+        if isinstance(held, VolumeInFile):
+            held = record.__dict__["volume"] = held.read()
+        return held
+
+    def __set__(self, record: Any, volume: Volume | VolumeInFile) -> None:
+        record.__dict__["volume"] = volume
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ReconRecord:
+    """The record of a volume: what was made, of what, how it was judged, and where it lies.
+
+    The same value is in the file of the volume, in the event `done` and in the results of `beamline.api`.
+
+    Attributes:
+        volume: `volume.data` float32 [z, y, x]; of an open file, a dataset that is sliced along z. Of a file just
+            written, it is read at the first use.
+        length_unit: "mm" where the pixel size is known, else "px".
+        raw_file: name of the scan it was made from.
+        time: s since the Unix epoch when it was made.
+        parameters: every setting used, by name; numbers, strings and arrays.
+        metrics: figures of merit, by name.
+        history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
+        deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
+        fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
+        series: all volumes in time, where `volume` is one of several; None: it is the only one.
+        kind: what the voxels are.
+        model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
+        compared: metrics of FBP of the same views; None without. This and what follows are of a volume that was made
+            by this program just now; files do not hold it.
+        warnings: sentences.
+        hiding: the warning of what the volume may hide; empty without.
+        chosen: how `auto`, a budget or a preset came to its settings; empty where they were given.
+        next_decibel, next_decibel_text: what one more decibel costs; None, and empty, where that is not known.
+        output, report: files of the volume and of its report; None: not written.
+        elapsed, times: s in all, and of each phase.
+    """
+
+    volume: VolumeField = VolumeField()
+    length_unit: str
+    raw_file: str
+    title: str
+    sample: str
+    time: float
+    parameters: Mapping[str, Value]
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    model: Mapping[str, Any] = field(default_factory=dict)
+    deviation: NDArray[np.float32] | None = None
+    fbp: NDArray[np.float32] | None = None
+    kind: VoxelKind = VoxelKind.ATTENUATION
+    series: VolumesInTime | None = None
+    compared: Mapping[str, float] | None = None
+    warnings: Sequence[str] = ()
+    hiding: str = ""
+    chosen: str = ""
+    next_decibel: NextDecibel | None = None
+    next_decibel_text: str = ""
+    output: Path | None = None
+    report: Path | None = None
+    elapsed: float = math.nan
+    times: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def grid(self) -> Grid:
+        """Of the volume, which is not read for it."""
+        held: Volume | VolumeInFile = self.__dict__["volume"]
+        return held.grid
+
+    @property
+    def unit(self) -> str:
+        """Of the voxels; empty for shares."""
+        return self.kind.unit(self.length_unit)
+
+    @property
+    def method(self) -> str:
+        """Its name; of a choice, that of the method chosen. Empty in the file of another program."""
+        return str(self.parameters.get("method", ""))
+
+    @property
+    def axis_col(self) -> float:
+        """Rotation axis in columns of the full detector; NaN where no file states it."""
+        return float(self.parameters.get("axis_col", math.nan))
+
+    @property
+    def ended_early(self) -> bool:
+        """It was stopped, and is the volume reached by then."""
+        return bool(self.parameters.get("ended_early", False))
+
+    @property
+    def figures(self) -> Mapping[str, float]:
+        """`metrics`, as scripts call them."""
+        return self.metrics
+
+    @property
+    def settings(self) -> Mapping[str, Value]:
+        """`parameters`, as scripts call them."""
+        return self.parameters
+
+    @property
+    def units(self) -> str:
+        """`unit`, as scripts call it."""
+        return self.unit
+
+    def __repr__(self) -> str:
+        return f"ReconRecord({self.method}: {' x '.join(map(str, self.grid.shape))} voxels, {self.output})"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the figures and the volume's middle slices."""
+        figures = ", ".join(f"{name} {value:.4g}" for name, value in self.metrics.items())
+        return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
+
+    def told(self) -> dict[str, Any]:
+        """What the event `done` says of it, by name, in the order of its line."""
+        parameters = self.parameters
+        ends = {name: parameters[name] for name in _ENDS if name in parameters}
+        others = {
+            "hiding": self.hiding or None,
+            "chosen": self.chosen or None,
+            "next_db": self.next_decibel,
+            "next_db_said": None if self.next_decibel is None else self.next_decibel_text,
+            "fbp": self.compared,
+        }
+        return {
+            "output": self.output,
+            "report": self.report,
+            "method": self.method,
+            "axis_col": self.axis_col,
+            "n_views": parameters.get("n_views"),
+            "shape": self.grid.shape,
+            "units": self.unit,
+            "elapsed": self.elapsed,
+            "times": self.times,
+            **self.metrics,
+            **ends,
+            **{name: value for name, value in others.items() if value is not None},
+        }
