@@ -77,7 +77,7 @@ def _axis_by_views(
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
-        found = axis_by_views(
+        estimate = axis_by_views(
             views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), near=stated is not None
         )  # fmt: skip
     except ValueError as error:
@@ -86,23 +86,23 @@ def _axis_by_views(
                 warn(f"The file's rotation axis, column {stated:.2f}, was not confirmed: {error}.")
             return stated, None
         raise _not_found(source, error) from error
-    axis_col = unbinned(found.value, binning)
+    axis_col = unbinned(estimate.value, binning)
     if stated is None:
-        if not found.confident:
+        if not estimate.confident:
             warn(_unclear(axis_col))
-        return axis_col, found
-    if not found.confident:
+        return axis_col, estimate
+    if not estimate.confident:
         warn(
             f"The file's rotation axis, column {stated:.2f}, was not confirmed: views held out show no axis clearly. "
             "Check the slices for doubled edges, or give --axis COLUMN."
         )
-    if not found.confident or found.value == geometry.axis_col:
+    if not estimate.confident or estimate.value == geometry.axis_col:
         return stated, None
     warn(
         f"Views held out agree better with a rotation axis in column {axis_col:.2f} than with the file's {stated:.2f}: "
         f"the former is used. --axis {stated:g} keeps the file's."
     )
-    return axis_col, found
+    return axis_col, estimate
 
 
 def _axis_beside_jumps(
@@ -116,9 +116,9 @@ def _axis_beside_jumps(
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            found = locate_axis(source, correction, part, lambda _: None, progress)
-            if found[1].confident:
-                return found
+            located = locate_axis(source, correction, part, lambda _: None, progress)
+            if located[1].confident:
+                return located
     return locate_axis(source, correction, usable.frames, warn, progress)
 
 
@@ -149,14 +149,14 @@ def locate_axis(
         raise _not_found(source, error) from error
     if all_there and not estimate.confident and source.axis_col is None:
         estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
-    found = unbinned(estimate.value, correction.binning)
+    axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
-        return found, estimate
+        return axis_col, estimate
     if source.axis_col is None:
-        warn(_unclear(found))
-        return found, estimate
+        warn(_unclear(axis_col))
+        return axis_col, estimate
     warn(
-        f"The rotation axis found, column {found:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
+        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
         "used. Check the slices, or give --axis COLUMN."
     )
     return source.axis_col, estimate
@@ -172,11 +172,11 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     dark, some = areas(band.masked), spread(np.arange(angles.size), VIEWS)
     data = np.ascontiguousarray(band.data[some])
     with suppress(ValueError):
-        found = axis_by_views(
+        estimate = axis_by_views(
             data, Geometry.parallel(angles[some], data.shape[1:]), lit=~dark if dark.any() else None
         )  # fmt: skip
-        if found.confident or dark.any():
-            return replace(found, confident=not dark.any())
+        if estimate.confident or dark.any():
+            return replace(estimate, confident=not dark.any())
     return None
 
 

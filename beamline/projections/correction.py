@@ -125,22 +125,22 @@ class ScanCorrection:
         stream, columns, alive = None, (0, 0), []
         if self._beam is not None and (survey := self._correction(None)) is not None:
             for done, part in enumerate(parts):
-                data, found = self._read(part, None)
-                alive.append(found)
-                if found.size:
-                    survey.survey(self._transmission(survey, data, found))
+                data, usable = self._read(part, None)
+                alive.append(usable)
+                if usable.size:
+                    survey.survey(self._transmission(survey, data, usable))
                 progress(min((done + 1) * batch, frames.size), passes * frames.size)
             columns = survey.air_columns
             settings = replace(self._beam.settings, air=columns if any(columns) else "none")
             stream = Correction(self._beam.references, settings, masked=survey.masked)
-            parts = [found for found in alive if found.size]
+            parts = [usable for usable in alive if usable.size]
         at, kept, begun = 0, [], (passes - 1) * frames.size
         for done, part in enumerate(parts):
             last = done == len(parts) - 1
-            data, found = self._read(part, None)
-            if stream is None and not found.size:
+            data, usable = self._read(part, None)
+            if stream is None and not usable.size:
                 continue
-            corrected = self._corrected(stream, data, found, last)
+            corrected = self._corrected(stream, data, usable, last)
             n = len(corrected.data)
             out[at : at + n] = corrected.data
             at += n

@@ -42,13 +42,13 @@ class ViewFilters:
             ConfigError: rows or binning that do not fit the detector, or filters of counted photons.
         """
         rows = rows_of(source, selection)
-        found = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
-        filters = tuple(each for each, _ in found.values() if each is not None)
+        outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
+        filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(CountModel).noise == "counts":
             raise ConfigError(
                 f"{filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
             )
-        done = {name: each for name, (_, each) in found.items()}
+        done = {name: each for name, (_, each) in outcomes.items()}
         return cls(filters, done, rows, selection.binning, source.shape[0])
 
     def read(self, rows: slice | None) -> slice:

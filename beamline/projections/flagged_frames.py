@@ -62,16 +62,16 @@ def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
         return {}
     darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
     wanted = {"dark": darks[:1], "flats": flats[:1], "last flats": flats[1:][-1:]}
-    found = {}
+    images = {}
     for title, groups in wanted.items():
         for group in groups:
             mean = np.mean([_small(source.read([row])[0]) for row in group[:4]], axis=0, dtype=np.float32)
-            found[f"{title} (counts)"] = np.asarray(mean, np.float32)
-    if len(found) == len(wanted):
-        dark, first, last = found.values()
+            images[f"{title} (counts)"] = np.asarray(mean, np.float32)
+    if len(images) == len(wanted):
+        dark, first, last = images.values()
         lit = first - dark > 0.1 * np.median(first - dark)
-        found["last flats / first"] = np.where(lit, (last - dark) / np.where(lit, first - dark, 1), np.nan)
-    return found
+        images["last flats / first"] = np.where(lit, (last - dark) / np.where(lit, first - dark, 1), np.nan)
+    return images
 
 
 def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list[int]:

@@ -106,10 +106,10 @@ class OpenBeam:
             ValueError: references that cannot be used.
         """
         references, settings = self.references.rows(rows), self.settings
-        found = Correction(references, settings, photons=self.photons)
+        plain = Correction(references, settings, photons=self.photons)
         if shadow is None or not shadow[rows].any():
-            return found
-        return Correction(references, settings, found.masked | shadow[rows], self.photons)
+            return plain
+        return Correction(references, settings, plain.masked | shadow[rows], self.photons)
 
     def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Mask | None:
         """bool [row, col], what stands in the beam of all views, by some of these; None: they are too few to tell.
@@ -120,15 +120,15 @@ class OpenBeam:
         if views.size < _LEAST_VIEWS:
             return None
         references, settings = replace(self.references, dynamic=None), replace(self.settings, air="none")
-        found = np.zeros(references.dark.shape, np.bool_)
+        in_shadow = np.zeros(references.dark.shape, np.bool_)
         views = views[np.linspace(0, views.size - 1, min(views.size, _SHADOW_VIEWS)).astype(int)]
-        for start in range(0, len(found), _BAND):
-            rows = slice(max(0, start - SHADOW_REACH), min(len(found), start + _BAND + SHADOW_REACH))
+        for start in range(0, len(in_shadow), _BAND):
+            rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * binning, first + rows.stop * binning)
             data = np.nan_to_num(read_binned(source, views, read, binning))
             light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
-            found[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-        return np.zeros_like(found) if found.all() else found
+            in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
+        return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow
 
 
 def count_references(source: ScanSource) -> int:

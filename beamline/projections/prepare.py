@@ -198,16 +198,16 @@ def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: floa
     )
 
 
-def _fill_unknown(found: PreparedProjections) -> None:
+def _fill_unknown(prepared: PreparedProjections) -> None:
     """Fill, view by view, what `ray_weights` says weighs nothing, as `masked` does for all views."""
-    data, geometry = found.projections.data, found.geometry
-    seen = seen_rays(geometry, Grid.matching(geometry)) if found.leaves_slices else None
+    data, geometry = prepared.projections.data, prepared.geometry
+    seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
         known = np.ones(geometry.detector_shape, np.float32)
-        if found.measured is not None:
-            known *= found.measured
-        if found.shares_of is not None:
-            shares = found.shares_of(slice(view, view + 1), slice(0, len(known)))
+        if prepared.measured is not None:
+            known *= prepared.measured
+        if prepared.shares_of is not None:
+            shares = prepared.shares_of(slice(view, view + 1), slice(0, len(known)))
             known *= 1 if shares is None else shares[0]
         if seen is not None:
             known *= seen[view]

@@ -92,13 +92,13 @@ class PreparedProjections:
         def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if array is None else array[..., rows, :]
 
-        found, held = self.projections, self.held_out
+        whole, held = self.projections, self.held_out
         if held is not None:
             held = held[0][:, rows], held[1].rows(rows.start, rows.stop)
         shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
         return replace(
             self,
-            projections=replace(found, data=found.data[:, rows], masked=found.masked[rows], weights=cut(found.weights)),
+            projections=replace(whole, data=whole.data[:, rows], masked=whole.masked[rows], weights=cut(whole.weights)),
             geometry=geometry,
             held_out=held,
             held_out_weights=cut(self.held_out_weights),

@@ -85,12 +85,12 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 
 def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
     """What the file of a volume records of the steps, by name."""
-    found: dict[str, Value] = {}
+    records: dict[str, Value] = {}
     for step in steps:
         did = done.get(step.name, StepDone())
         said = {f"{step.name}_said": did.said} if did.said else {}
-        found |= _options(step) | said if did.parameters is None else did.parameters
-    return found
+        records |= _options(step) | said if did.parameters is None else did.parameters
+    return records
 
 
 def _options(step: PrepStep) -> dict[str, Value]:

@@ -191,12 +191,12 @@ def judged_flags(source: ScanSource) -> FrameFlags:
 
 def by_kind(flags: Iterable[Flag]) -> tuple[Kind, ...]:
     """Flags by check and level, the worst level first, then those of most frames."""
-    found: dict[tuple[str, Level], list[Flag]] = {}
+    grouped: dict[tuple[str, Level], list[Flag]] = {}
     for flag in flags:
-        found.setdefault((flag.check, flag.level), []).append(flag)
+        grouped.setdefault((flag.check, flag.level), []).append(flag)
     kinds = [
-        Kind(*key, tuple(sorted(frames)), max(found[key], key=_excess))
-        for key, frames in flagged_frames(chain.from_iterable(found.values())).items()
+        Kind(*key, tuple(sorted(frames)), max(grouped[key], key=_excess))
+        for key, frames in flagged_frames(chain.from_iterable(grouped.values())).items()
     ]
     levels = (Level.ALARM, Level.WARN, Level.INFO)
     return tuple(sorted(kinds, key=lambda kind: (levels.index(kind.level), -len(kind.frames))))

@@ -188,14 +188,14 @@ def dose_scale(light: Light | None) -> tuple[float, str]:
     return light.gray, f"dose in {light.material} (Gy)"
 
 
-def light_of(source: ScanSource, found: list[KindStatistics], asked: LightAsked) -> Light:
+def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightAsked) -> Light:
     """From the flats and darks among the statistics `found`.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`.
     """
     asked.refuse_impossible(source)
-    mean = {each.kind: each.mean for each in found}
+    mean = {each.kind: each.mean for each in statistics}
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
     seconds = (source.exposures[source.image_key == kind] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
     known = [each[np.isfinite(each)] for each in seconds]
@@ -221,7 +221,7 @@ def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
     return light_of(source, statistics_of(source, lambda n, of: None, (FrameKind.DARK, FrameKind.FLAT)), asked)
 
 
-def table(found: list[KindStatistics]) -> list[tuple[str, ...]]:
+def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
     """Head, and a row for each kind."""
     percent = tuple(f"{p:g} %" for p in PERCENT)
     head = ("kind", "frames", "min", *percent, "max", "mean", "std", "saturated", "not finite")
@@ -231,16 +231,16 @@ def table(found: list[KindStatistics]) -> list[tuple[str, ...]]:
             *(f"{v:.6g}" for v in (each.minimum, *each.percentiles, each.maximum, each.mean, each.deviation)),
             f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.2g} %",
         )
-        for each in found
+        for each in statistics
     ]  # fmt: skip
     return [head, *rows]
 
 
-def histograms(found: list[KindStatistics]) -> bytes:
+def histograms(statistics: list[KindStatistics]) -> bytes:
     """Pixels against their values, a curve a kind, as PNG; at most 400 bins each."""
     figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    for each in found:
+    for each in statistics:
         step = max(1, -(-each.pixels.size // 400))
         starts = np.arange(0, each.pixels.size, step)
         edges = np.append(each.edges[starts], each.edges[-1])

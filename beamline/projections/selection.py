@@ -156,12 +156,12 @@ def pixel_size(source: ScanSource, selection: Selection) -> float | None:
     Raises:
         ConfigError: no detector has such pixels.
     """
-    found = source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
+    size_mm = source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
     low, high = _PIXEL_SIZES_UM
-    if found is not None and not low <= found * 1e3 <= high:
+    if size_mm is not None and not low <= size_mm * 1e3 <= high:
         whose = source.path if selection.pixel_size_mm is None else "--pixel-size-um"
         raise ConfigError(
-            f"{whose}: a pixel size of {found * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one with "
-            "--pixel-size-um."
+            f"{whose}: a pixel size of {size_mm * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one "
+            "with --pixel-size-um."
         )
-    return found
+    return size_mm

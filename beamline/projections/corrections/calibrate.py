@@ -240,24 +240,24 @@ def without_learnt_background(views: PreparedProjections, progress: Progress) ->
         return np.clip((numbers - first) / max(last - first, 1), 0.0, 1.0)
 
     try:
-        found = learn_background(data, views.geometry, times(ids), views.measured, progress)
+        learnt = learn_background(data, views.geometry, times(ids), views.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate background: {error}. Leave it out.") from error
-    judged = f"views held out are left {found.without:.3g} without it and {found.left:.3g} with it"
-    values = {"learnt_background_held_out_before": found.without, "learnt_background_held_out_after": found.left}
-    if not (found.drift or found.mean):
+    judged = f"views held out are left {learnt.without:.3g} without it and {learnt.left:.3g} with it"
+    values = {"learnt_background_held_out_before": learnt.without, "learnt_background_held_out_after": learnt.left}
+    if not (learnt.drift or learnt.mean):
         said = "Background learnt with the volume: views held out confirm none; nothing taken off."
         return StepDone(said, {"learnt_background": said, **values})
-    found.remove(data, times(ids))
+    learnt.remove(data, times(ids))
     if views.held_out is not None and views.held_out_ids is not None:
-        found.remove(views.held_out[0], times(views.held_out_ids))
-    what = " and ".join(name for name, there in (("its drift", found.drift), ("its mean", found.mean)) if there)
+        learnt.remove(views.held_out[0], times(views.held_out_ids))
+    what = " and ".join(name for name, there in (("its drift", learnt.drift), ("its mean", learnt.mean)) if there)
     said = (
-        f"Background learnt with the volume: {what}, {found.size:.3f} of line integral (root mean square), on average "
-        f"from {found.lowest:+.3f} to {found.highest:+.3f}; taken off: {judged}. What all views show alike cannot be "
+        f"Background learnt with the volume: {what}, {learnt.size:.3f} of line integral (root mean square), on average "
+        f"from {learnt.lowest:+.3f} to {learnt.highest:+.3f}; taken off: {judged}. What all views show alike cannot be "
         "told from density where the volume has no air."
     )
-    return StepDone(said, {"learnt_background": said, "learnt_background_terms": found.coefficients, **values})
+    return StepDone(said, {"learnt_background": said, "learnt_background_terms": learnt.coefficients, **values})
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
@@ -265,22 +265,22 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     from recon.calibration.gains import NEAR_AXIS, learn_gains
 
     try:
-        found = learn_gains(views.projections.data, views.geometry, views.measured, progress)
+        learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
-    values = {"learnt_gains_held_out_before": found.without, "learnt_gains_held_out_after": found.left}
-    judged = f"views held out are left {found.without:.4g} without them and {found.left:.4g} with them"
-    if found.without == 0:
+    values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
+    judged = f"views held out are left {learnt.without:.4g} without them and {learnt.left:.4g} with them"
+    if learnt.without == 0:
         judged = "no stripes are seen in the views that are the detector's"
-    if not found.confirmed:
+    if not learnt.confirmed:
         said = f"Gains learnt with the volume: none taken off; {judged}."
         return StepDone(said, {"learnt_gains": said, **values})
     for view in views.projections.data:
-        view -= found.pixels
+        view -= learnt.pixels
     if views.held_out is not None:
-        views.held_out[0][...] -= found.pixels
+        views.held_out[0][...] -= learnt.pixels
     said = (
-        f"Gains learnt with the volume: {float(found.pixels.std()):.4f} of line integral (standard deviation) taken "
+        f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
         f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."
     )
-    return StepDone(said, {"learnt_gains": said, "learnt_gains_of_pixels": found.pixels, **values})
+    return StepDone(said, {"learnt_gains": said, "learnt_gains_of_pixels": learnt.pixels, **values})

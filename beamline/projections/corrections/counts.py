@@ -112,19 +112,19 @@ def photons_of(
                 f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
-        found = Photons(wanted.gain / binning**2, variance)
+        photons = Photons(wanted.gain / binning**2, variance)
     else:
         try:
-            found = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
+            photons = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
         except ValueError as error:
             if wanted.noise == "auto":
                 return None
             raise ConfigError(
                 f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
             ) from error
-    if wanted.noise == "auto" and not light_of(references, found) < FEW_PHOTONS:
+    if wanted.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
         return None
-    return found
+    return photons
 
 
 def light_of(references: References, photons: Photons) -> float:

@@ -148,18 +148,18 @@ def find_jumps(
         return _done(fit, clusters, apart, [Displacement()])
     levels = fit.levels()
     looked = [fit.views(apart, factor, rounds) for factor, rounds in levels[:_ROUGH]]
-    found = _needed(fit.sizes, clusters, apart, looked, progress)
-    assert found.verdict is not None
-    bad = np.flatnonzero(~_good(found.verdict))
-    real = sorted({*found.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
+    best = _needed(fit.sizes, clusters, apart, looked, progress)
+    assert best.verdict is not None
+    bad = np.flatnonzero(~_good(best.verdict))
+    real = sorted({*best.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
     groups = part_groups(fit.sizes, real)
     spoilt = np.isin(apart, bad)
-    moves = [found.moves[max(apart[groups == at])] for at in range(groups.max() + 1)]
+    moves = [best.moves[max(apart[groups == at])] for at in range(groups.max() + 1)]
     for factor, rounds in levels[_ROUGH:] if len(moves) > 1 else ():
         moves = fit.views(np.where(spoilt, -1, groups), factor, rounds).displacements(moves)
     if not bad.size and fit.largest(moves) < LARGEST:
         return _done(fit, [], part_groups(fit.sizes, []), [Displacement()])
-    return _done(fit, real, np.where(spoilt, -1, groups), moves, found.verdict, bool(bad.size))
+    return _done(fit, real, np.where(spoilt, -1, groups), moves, best.verdict, bool(bad.size))
 
 
 def _search_memory(source: ScanSource, selection: Selection) -> int:

@@ -103,19 +103,19 @@ class Phase:
     def memory(self, part: ScanPart) -> StepMemory:
         if self.material is None:
             return StepMemory()
-        found, _ = self.filter_of(part.source, part.selection)
-        return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(found.reach))
+        paganin, _ = self.filter_of(part.source, part.selection)
+        return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach))
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None:
             return None, StepDone("", {"phase": "not retrieved"})
-        found, said = self.filter_of(source, selection)
+        paganin, said = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
-            found.retrieve(views.data, selection.step(Defects).floor)
+            paganin.retrieve(views.data, selection.step(Defects).floor)
             return views
 
-        return ViewFilter(apply, found.reach, "--phase mixes"), StepDone(said, {"phase": said})
+        return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(said, {"phase": said})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
         """The filter for the pixels that the selection makes, and a sentence about it.
@@ -144,15 +144,15 @@ class Phase:
         said = f"delta/beta {ratio:.4g} at {energy:g} keV, {distance:g} mm behind the sample"
         if cone is not None:
             distance, pitch = distance * cone[0] / (cone[0] + distance), pitch * cone[0] / cone[1]
-        found = Paganin(length_of(ratio, distance, energy, pitch * selection.binning), self.unsharp)
-        if found.length > max(source.shape) / selection.binning:
+        paganin = Paganin(length_of(ratio, distance, energy, pitch * selection.binning), self.unsharp)
+        if paganin.length > max(source.shape) / selection.binning:
             raise ConfigError(
-                f"--phase: {said}, is a filter over {found.length:.4g} pixels; {source.path} has "
+                f"--phase: {said}, is a filter over {paganin.length:.4g} pixels; {source.path} has "
                 f"{source.shape[0]} x {source.shape[1]}. Check ratio, energy (keV) and distance (mm)."
             )
-        mask = "" if found.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*found.unsharp)
-        said = f"Phase: Paganin's filter over {found.length:.3g} pixels ({said}){mask}."
-        return found, said
+        mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
+        said = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({said}){mask}."
+        return paganin, said
 
 
 def _stated(source: ScanSource) -> float | None:

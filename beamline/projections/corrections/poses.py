@@ -185,7 +185,7 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     n, views = source.image_key.size, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if table.frames is not None and table.frames != n:
         raise DataError(f"{table.path} has {table.frames} frames, {source.path} has {n}; expected the same scan.")
-    found, degrees = np.full(n, -1, np.int64), np.degrees(source.angles)
+    row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.angles)
     distances = np.diff(np.unique(np.round(degrees[frames], 9)))
     tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
     if table.by == "angle_deg":
@@ -196,7 +196,7 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
         wanted = degrees[views]
         nearest = np.where(np.abs(ordered[left] - wanted) < np.abs(ordered[right] - wanted), left, right)
         close = np.abs(ordered[nearest] - wanted) <= tolerance
-        found[views[close]] = order[nearest[close]]
+        row_of_frame[views[close]] = order[nearest[close]]
     else:
         into = views if table.by == "view" else np.arange(n)
         if (beyond := table.keys >= into.size).any():
@@ -204,17 +204,18 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
                 f"{table.path} states {table.by} {table.keys[beyond][0]:g}; {source.path} has {into.size} {table.by}s, "
                 "counted from 0."
             )
-        found[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
+        row_of_frame[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
         if table.angles_deg is not None:
-            both = frames[found[frames] >= 0]
-            off = np.abs(table.angles_deg[found[both]] - degrees[both])
+            both = frames[row_of_frame[frames] >= 0]
+            off = np.abs(table.angles_deg[row_of_frame[both]] - degrees[both])
             if (off > tolerance).any():
                 at = int(both[off > tolerance][0])
+                stated = table.angles_deg[row_of_frame[at]]
                 raise DataError(
-                    f"{table.path} states frame {at} at {table.angles_deg[found[at]]:.6g} degrees, {source.path} at "
+                    f"{table.path} states frame {at} at {stated:.6g} degrees, {source.path} at "
                     f"{degrees[at]:.6g}; expected the poses of the same scan."
                 )
-    return found
+    return row_of_frame
 
 
 def require_known(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:

@@ -107,22 +107,23 @@ class TiltAndLens:
         from recon.prep.tilt import STEEPEST
 
         known = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
-        if (found := known.of(part.source, part.selection)) is None:
+        if (steepest := known.of(part.source, part.selection)) is None:
             return StepMemory()
         copies = 17 if self.distortion is None else 26
         search = _search_memory(part.source, part.selection) if self.sought else 0
-        return StepMemory(copies * part.view_bytes(found.reach), search)
+        return StepMemory(copies * part.view_bytes(steepest.reach), search)
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
-        found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."
-        if found is None:
+        resampling = self.of(source, selection)
+        if resampling is None:
             return None, self.done("")
 
         def apply(views: Projections, first: int) -> Projections:
-            found.apply(views.data, first)
-            return replace(views, masked=found.nearest(views.masked, first))
+            resampling.apply(views.data, first)
+            return replace(views, masked=resampling.nearest(views.masked, first))
 
-        return ViewFilter(apply, found.reach, "--tilt and --distortion mix"), self.done(turned if self.tilt_deg else "")
+        turned = f"Views are turned by {self.tilt_deg:g} degrees." if self.tilt_deg else ""
+        return ViewFilter(apply, resampling.reach, "--tilt and --distortion mix"), self.done(turned)
 
     def done(self, said: str) -> StepDone:
         """What it did, with what is recorded where nothing was asked, too."""
