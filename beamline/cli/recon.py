@@ -258,8 +258,8 @@ def recon(
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
-    from beamline.reconstruct.finished import reconstruct_file
     from beamline.reconstruct.follow import follow as follow_scan
+    from beamline.reconstruct.offline import reconstruct_file
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from recon.voxels.enough_views import Goal
