@@ -17,7 +17,7 @@ from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
-from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
 from beamline.storage.interrupted import scan_file

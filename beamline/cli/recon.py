@@ -168,8 +168,8 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
         as it should be.
     """
-    from beamline.reconstruct.finished import reconstruct_file  # here: help needs none of it
     from beamline.reconstruct.follow import follow as follow_scan
+    from beamline.reconstruct.offline import reconstruct_file  # here: help needs none of it
 
     last: list[Event] = []
     stop = StopOnSignal(ready=values["follow"] or options.budget is not None)

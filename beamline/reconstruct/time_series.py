@@ -19,7 +19,7 @@ from beamline.core.sinks import Warnings
 from beamline.core.text import size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.view_geometry import stated_geometry
-from beamline.reconstruct.finished import require_finished
+from beamline.reconstruct.offline import require_finished
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.parameters import parameters_of

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.reconstruct import budget, checkpoints
-from beamline.reconstruct import finished as offline
+from beamline.reconstruct import budget, checkpoints, offline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl

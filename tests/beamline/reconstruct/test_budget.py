@@ -17,7 +17,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
 from beamline.reconstruct.budget import Budgeted, binned, within
-from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions

@@ -16,8 +16,8 @@ from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import in_time
-from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
+from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions

@@ -13,7 +13,7 @@ from beamline.cli.terminal import results
 from beamline.core.events import Event, VolumeDone
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
-from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions

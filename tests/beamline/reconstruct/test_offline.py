@@ -16,11 +16,10 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct import checkpoints
-from beamline.reconstruct import finished as offline
+from beamline.reconstruct import checkpoints, offline
 from beamline.reconstruct import result as deliver
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
