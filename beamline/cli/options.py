@@ -47,6 +47,12 @@ set_option = click.option(
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
 )
+dry_option = click.option(
+    "--dry-run",
+    "dry",
+    is_flag=True,
+    help="Print what would run, the time and memory it will take and what would be written, and end.",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON event per line to stdout.")
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]

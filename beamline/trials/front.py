@@ -50,6 +50,7 @@ _FIGURES = {
     "resolution": _Figure("FSC", "FSC ({})", "period in {} to which two halves of the views agree", _period),
 }
 
+_NEAR = 0.5  # dB below the best figure, which eyes hardly see on slices
 _FSC = (
     "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
     "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
@@ -208,7 +209,12 @@ def conclusions(table: TrialTable) -> list[str]:
     out = [f"Quality: {table.quality.words}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
-    first = compared[kept[0]]
+    first, best, pick = compared[kept[0]], compared[kept[-1]], kept[worth_its_time(table) or 0]
+    words = f"Best for its time: {compared[pick].trial.label}: {qualities[pick]:.2f} dB in {_duration(seconds[pick])}"
+    if pick != kept[-1]:
+        gain, more = qualities[kept[-1]] - qualities[pick], _duration(best.seconds - seconds[pick])
+        words += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
+    out = [f"{words}.", *out]
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for stretch in pareto.steps(kept, seconds, qualities):
         chance = "" if not table.quality.of_views else f" ± {table.chance(stretch.end, stretch.start):.2f}"
@@ -220,6 +226,13 @@ def conclusions(table: TrialTable) -> list[str]:
     if any("resolution" in outcome.metrics for outcome in compared):
         out.append(_FSC)
     return out
+
+
+def worth_its_time(table: TrialTable) -> int | None:
+    """Number on the front of time of the quickest trial within `_NEAR` of the best one; None without a front."""
+    front, qualities = table.front(TIME), table.qualities
+    near = [n for n, i in enumerate(front) if qualities[i] >= qualities[front[-1]] - _NEAR]
+    return near[0] if near else None
 
 
 def _level(table: TrialTable, last: int) -> list[str]:
@@ -243,4 +256,6 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
         table.front(cost),
         cost.axis,
         table.quality.axis,
+        cost.unit,
+        worth_its_time(table) if cost is TIME else None,
     )
