@@ -36,7 +36,7 @@ class ExpectedTrial:
 
 
 @dataclass(frozen=True)
-class DryRun:
+class ExpectedRun:
     """What a comparison will take.
 
     Attributes:
@@ -90,7 +90,7 @@ def dry_run(
     folder: Path,
     warn: Warn,
     now: Callable[[], float] = time.process_time,
-) -> DryRun:
+) -> ExpectedRun:
     """Plan a comparison and measure a sweep; nothing is written. Times are rough: within a factor of two.
 
     Args:
@@ -112,7 +112,7 @@ def dry_run(
         return ExpectedTrial(trial.label, None if seconds is None else start + seconds, _memory(trial, data, own))
 
     free = shutil.disk_usage(folder.absolute().parent).free
-    return DryRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())
+    return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())
 
 
 def _memory(trial: Trial, data: Data, own: int) -> int | None:

@@ -18,6 +18,7 @@ from recon.methods import names
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
+_APART = 16.0  # pixels between two numbers on the same side of their points, at least
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
     "loss": "X", "start": "*", "rectification": "h",
@@ -66,11 +67,15 @@ def pareto_plot(
         axes.set_ylim(bottom=lowest)
         note = f"{len(below)} more below {lowest:.1f} dB"
         axes.text(0.99, 0.02, note, transform=axes.transAxes, ha="right", fontsize=8, color="0.4")
+    before = None
     for number, (_, cost, quality) in enumerate(kept, start=1):
+        place = axes.transData.transform((cost, quality))
+        beside = before is not None and float(np.hypot(*(place - before))) < _APART
         axes.annotate(
-            str(number), (cost, quality), xytext=(-6, 5), textcoords="offset points", ha="right", fontsize=9,
-            fontweight="bold",
+            str(number), (cost, quality), xytext=(7, -9) if beside else (-6, 5), textcoords="offset points",
+            ha="left" if beside else "right", fontsize=9, fontweight="bold",
         )  # fmt: skip
+        before = None if beside else place
     if pick is not None:
         _, cost, quality = kept[pick]
         axes.scatter(cost, quality, s=220, facecolors="none", edgecolors="black", linewidths=1.4, zorder=5)

@@ -26,7 +26,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.trials.cost import expected_seconds
 from beamline.trials.data import Data, write_array
 from beamline.trials.launch import DATA, compile_kernels, run_trial
-from beamline.trials.layout import Layout, event_of, write_page, write_table
+from beamline.trials.layout import TableLayout, event_of, write_page, write_table
 from beamline.trials.plans import Timed, seconds_left
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
@@ -105,7 +105,7 @@ class Planned:
     """
 
     table: TrialTable
-    layout: Layout
+    layout: TableLayout
     started: Event
     reference: Trial | None = None
 
@@ -253,7 +253,7 @@ def until_stopped(table: TrialTable, grown: Iterable[TrialTable], write: Callabl
     return table
 
 
-def _each(table: TrialTable, layout: Layout, rig: _Rig, slices: SliceSheet) -> Iterator[TrialTable]:
+def _each(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet) -> Iterator[TrialTable]:
     """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets those that the page shows."""
     begin, timed, todo = rig.now(), list[Timed](), table.todo
     for n, index in enumerate(todo):
