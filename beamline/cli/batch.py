@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.options import json_option
+from beamline.cli.options import dry_option, json_events, json_option
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Done
-from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
+from beamline.reconstruct.batch import TABLE, BatchOptions, planned_batch, run_batch
 from drivers.base.clock import SystemClock
 
 
@@ -42,8 +42,9 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
     required=True,
     help="Folder of the results: new, or that of an earlier call with the same recipe, which is continued.",
 )
+@dry_option
 @json_option
-def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -> None:
+def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_json: bool) -> None:
     """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
 
     Each scan gets a folder in --output with its volume, report and log; batch.csv says what became of it, and why it
@@ -51,6 +52,13 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
     code 4). Exit code 5: a scan failed.
     """
     options, clock = BatchOptions(scans, config, output), SystemClock()
+    if dry:
+        planned = planned_batch(options)
+        with json_events(as_json) as sink:
+            sink(Done(planned, time=clock.now()))
+        if not as_json:
+            click.echo("\n".join(planned.lines()))
+        return
     with events_shown(as_json) as sink:
         try:
             rows = run_batch(options, sink, clock)

@@ -136,6 +136,10 @@ json_option = option(
     "--json", "as_json", is_flag=True, in_time=True, of_one_call=True, repeated=False,
     help="Print one JSON event per line to stdout.",
 )  # fmt: skip
+dry_option = option(
+    "--dry-run", "dry", is_flag=True, repeated=False,
+    help="Print what would run, the time and memory it will take and what would be written, and end.",
+)  # fmt: skip
 
 
 def names_in(value: str) -> tuple[str, ...]:

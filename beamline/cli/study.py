@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -9,11 +10,11 @@ import click
 
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
-from beamline.cli.options import SEED, json_option, scan_argument
+from beamline.cli.options import SEED, dry_option, json_option, scan_argument
 from beamline.cli.recipe import repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import events_shown
+from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from beamline.core.files import REPORT
 from beamline.trials.view_choices import STUDIES
@@ -24,7 +25,7 @@ from recon.methods import BASELINE, DEFAULT, names
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output"),
+    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output", "dry"),
 )
 @heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
@@ -64,6 +65,7 @@ from recon.methods import BASELINE, DEFAULT, names
     help="How often the study random draws its views.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@dry_option
 @heading(OUTPUT)
 @click.option(
     "-o",
@@ -84,6 +86,7 @@ def study(
     draws: int,
     seed: int,
     output: Path | None,
+    dry: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -99,7 +102,7 @@ def study(
     """
     from beamline.trials.layout import text
     from beamline.trials.runner import ComparedScan
-    from beamline.trials.study import StudyLayout, StudyOptions, run_study
+    from beamline.trials.study import StudyLayout, StudyOptions, planned_study, run_study
 
     methods = tuple(dict.fromkeys(methods))
     lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
@@ -119,6 +122,9 @@ def study(
         seed=seed,
         command=repeating(click.get_current_context(), file, folder),
     )
+    if dry:
+        print_dry_run(partial(planned_study, options), folder, as_json)
+        return
     with events_shown(as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not as_json:

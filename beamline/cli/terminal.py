@@ -9,8 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Self, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -31,9 +33,10 @@ from beamline.core.events import (
 )
 from beamline.core.narration import sentence
 from beamline.core.signals import terminated_like_interrupted
+from beamline.core.sinks import Warn, Warnings
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
-from drivers.base.clock import Clock
+from drivers.base.clock import Clock, SystemClock
 from drivers.manual import Ask
 from recon.methods import BASELINE
 
@@ -185,6 +188,18 @@ def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
     if not (done.of and done.per_s) or done.eta_s is None:
         return "begun"
     return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
+
+
+def print_dry_run(plan: Callable[[Warn], tuple[Any, Any]], folder: Path, as_json: bool) -> None:
+    """Print what a comparison will take; see `beamline.trials.dry_run`."""
+    from beamline.trials.dry_run import dry_run
+
+    clock = SystemClock()
+    with events_shown(as_json) as sink:
+        expected = dry_run(plan, folder, Warnings(sink, clock))
+        sink(Done(expected, time=clock.now()))
+    if not as_json:
+        click.echo("\n".join(expected.lines()))
 
 
 def trials(done: TrialReached, what: str = "trials") -> str:

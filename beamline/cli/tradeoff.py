@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import click
 
 from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import POSITIVE, SEED, json_option, names_in, parsed
+from beamline.cli.options import POSITIVE, SEED, dry_option, json_option, names_in, parsed
 from beamline.cli.recipe import repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import events_shown
+from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
 from recon.methods import names, names_compared
@@ -42,6 +43,7 @@ def listed(value: str) -> tuple[str, ...]:
         "binning",
         "axis",
         "output",
+        "dry",
     ),
 )
 @heading(DATA)
@@ -84,6 +86,7 @@ def listed(value: str) -> tuple[str, ...]:
     help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
     "would not fit is not begun.",
 )
+@dry_option
 @heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
 @heading(OUTPUT)
@@ -108,6 +111,7 @@ def tradeoff(
     max_seconds: float | None,
     seed: int,
     output: Path | None,
+    dry: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -126,7 +130,7 @@ def tradeoff(
     from beamline.trials.front import TRADEOFF
     from beamline.trials.layout import text
     from beamline.trials.runner import ComparedScan
-    from beamline.trials.tradeoff import Several, TradeoffOptions, run_tradeoff
+    from beamline.trials.tradeoff import Several, TradeoffOptions, planned_tradeoff, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
     if seconds is not None and (volumes is not None or spectra is not None):
@@ -146,7 +150,11 @@ def tradeoff(
             seed=seed,
             command=repeating(click.get_current_context(), files, folder),
         )
-        table = run_tradeoff(options, sink, SystemClock(), begun=begun)
+        if not dry:
+            table = run_tradeoff(options, sink, SystemClock(), begun=begun)
+    if dry:
+        print_dry_run(partial(planned_tradeoff, options), folder, as_json)
+        return
     if not as_json:
         click.echo(text(table, TRADEOFF))
         click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")

@@ -17,8 +17,10 @@ from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
+from beamline.core.text import size
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.base.clock import Clock
+from recon.assess.time_model import duration_text
 
 RowState = Literal["waiting", "done", "poor", "failed"]
 
@@ -93,6 +95,55 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
             return _run_all(options, worker, sink, clock)
     finally:
         lock.release()
+
+
+@dataclass(frozen=True)
+class BatchPlan:
+    """What a call would do.
+
+    Attributes:
+        rows: all rows of the table, with those of this call.
+        sizes: bytes of the file of each scan that waits, by its row's name; where the file is there.
+        seconds: of all scans that wait, from those that are done and the sizes of the files; None: none is done.
+    """
+
+    folder: Path
+    rows: Sequence[BatchRow]
+    sizes: Mapping[str, int]
+    seconds: float | None
+
+    def lines(self) -> list[str]:
+        """For people."""
+        width = max((len(row.name) for row in self.rows), default=4)
+        rows = [f"{row.name:<{width}}  {row.state:<8}{row.scan}" for row in self.rows]
+        waiting = sum(not row.has_volume for row in self.rows)
+        hint = "not known before a scan is done; `beamline recon SCAN --dry-run` measures it, and the memory, for one"
+        time = hint if self.seconds is None else f"about {duration_text(self.seconds)}, from the scans that are done"
+        return [
+            *rows,
+            "",
+            f"{'scans':<10}{len(self.rows)}, of which {waiting} wait: {size(sum(self.sizes.values()))} of files",
+            f"{'time':<10}{time if waiting else 'none: every scan has a volume'}",
+            f"{'output':<10}{self.folder}: {TABLE}, and a folder a scan (not written now)",
+        ]
+
+
+def planned_batch(options: BatchOptions) -> BatchPlan:
+    """What `run_batch` would do. Nothing is written, and no scan is opened.
+
+    Raises:
+        DataError: as `run_batch`, which would refuse the folder.
+    """
+    folder, known = options.folder, list[BatchRow]()
+    if folder.exists():
+        _refuse_other(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+        known = _read(folder)
+    rows = _rows(options.scans, known)
+    bytes_of = {row.name: path.stat().st_size for row in rows if (path := Path(row.scan)).is_file()}
+    waiting = {row.name: bytes_of[row.name] for row in rows if not row.has_volume and row.name in bytes_of}
+    done = [row for row in rows if row.has_volume and row.seconds and bytes_of.get(row.name)]
+    rate = sum(row.seconds or 0 for row in done) / sum(bytes_of[row.name] for row in done) if done else None
+    return BatchPlan(folder, rows, waiting, None if rate is None else rate * sum(waiting.values()))
 
 
 class Worker:
@@ -202,15 +253,21 @@ def _shared(names: Sequence[str]) -> list[bool]:
 
 def _begin(folder: Path, recipe: bytes) -> None:
     """Make the folder, or check that it belongs to this recipe."""
+    if folder.exists():
+        _refuse_other(folder, recipe)
+        return
+    with whole_file(folder) as partial:
+        partial.mkdir()
+        (partial / RECIPE).write_bytes(recipe)
+        _write(partial, [])
+
+
+def _refuse_other(folder: Path, recipe: bytes) -> None:
+    """Raises DataError for a folder that is not that of a batch by this recipe."""
     kept = folder / RECIPE
-    if folder.exists() and not (folder / TABLE).is_file():
+    if not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
-    if not folder.exists():
-        with whole_file(folder) as partial:
-            partial.mkdir()
-            (partial / RECIPE).write_bytes(recipe)
-            _write(partial, [])
-    elif not kept.is_file() or kept.read_bytes() != recipe:
+    if not kept.is_file() or kept.read_bytes() != recipe:
         raise DataError(
             f"{folder} holds results of another recipe, {kept}. Give that one as --config, or name another folder. "
             "Nothing was touched."

@@ -18,6 +18,7 @@ from recon.methods import names
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
+_APART = 16.0  # pixels between two numbers on the same side of their points, at least
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
     "loss": "X", "start": "*", "rectification": "h",
@@ -26,7 +27,12 @@ _MARKERS = {
 
 
 def pareto_plot(
-    points: Sequence[tuple[Trial, float, float]], front: Sequence[int], cost_label: str, quality_label: str
+    points: Sequence[tuple[Trial, float, float]],
+    front: Sequence[int],
+    cost_label: str,
+    quality_label: str,
+    unit: str = "",
+    pick: int | None = None,
 ) -> bytes:
     """Quality against cost; the line is the best quality at each cost.
 
@@ -34,6 +40,8 @@ def pareto_plot(
         points: (trial, cost, dB); points that are not finite are left out.
         front: positions of the points on the front, by rising cost.
         cost_label, quality_label: with units.
+        unit: of the cost.
+        pick: number in `front` of the trial that is worth its cost, which gets a ring; None: of none.
     """
     figure = Figure(figsize=(_SIZE[0], _SIZE[1] + 0.18 * len(front)), dpi=_DPI, layout="constrained")
     axes: Axes = figure.subplots()
@@ -53,21 +61,31 @@ def pareto_plot(
     _scale(axes, [c for _, c, _ in shown])
     axes.margins(x=0.08, y=0.1)
     best = max((q for _, _, q in shown), default=0.0)
-    below = [q for _, _, q in shown if q < best - _SHOWN_DB]
+    lowest = min([best - _SHOWN_DB, *(q - 0.5 for _, _, q in kept)])  # the front is drawn whole
+    below = [q for _, _, q in shown if q < lowest]
     if below:
-        axes.set_ylim(bottom=best - _SHOWN_DB)
-        note = f"{len(below)} more below {best - _SHOWN_DB:.1f} dB"
+        axes.set_ylim(bottom=lowest)
+        note = f"{len(below)} more below {lowest:.1f} dB"
         axes.text(0.99, 0.02, note, transform=axes.transAxes, ha="right", fontsize=8, color="0.4")
+    before = None
     for number, (_, cost, quality) in enumerate(kept, start=1):
+        place = axes.transData.transform((cost, quality))
+        beside = before is not None and float(np.hypot(*(place - before))) < _APART
         axes.annotate(
-            str(number), (cost, quality), xytext=(-6, 5), textcoords="offset points", ha="right", fontsize=9,
-            fontweight="bold",
+            str(number), (cost, quality), xytext=(7, -9) if beside else (-6, 5), textcoords="offset points",
+            ha="left" if beside else "right", fontsize=9, fontweight="bold",
         )  # fmt: skip
+        before = None if beside else place
+    if pick is not None:
+        _, cost, quality = kept[pick]
+        axes.scatter(cost, quality, s=220, facecolors="none", edgecolors="black", linewidths=1.4, zorder=5)
     axes.set(xlabel=cost_label, ylabel=quality_label)
     axes.grid(alpha=0.25)
     _legend(figure, axes, shown)
-    names = [f"{number}  {trial.label}: {quality:.2f} dB" for number, (trial, _, quality) in enumerate(kept, start=1)]
-    figure.supxlabel("\n".join(names), fontsize=8, x=0.06, ha="left", linespacing=1.5)
+    lines = [f"{n + 1}  {t.label}: {quality:.2f} dB, {cost:.3g} {unit}" for n, (t, cost, quality) in enumerate(kept)]
+    if pick is not None:
+        lines[pick] += "   (ring: best for its time)"
+    figure.supxlabel("\n".join(lines), fontsize=8, x=0.06, ha="left", linespacing=1.5)
     return png(figure)
 
 

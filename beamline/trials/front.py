@@ -14,7 +14,7 @@ from beamline.report.metrics import METRICS
 from beamline.report.slice_sheet import SliceSheet
 from beamline.trials import pareto
 from beamline.trials.figures import cost_curves, pareto_plot
-from beamline.trials.layout import Column
+from beamline.trials.layout import TableColumn
 from beamline.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
 from beamline.trials.trial import Outcome
 from recon.assess.time_model import duration_text
@@ -50,6 +50,7 @@ _FIGURES = {
     "resolution": _Figure("FSC", "FSC ({})", "period in {} to which two halves of the views agree", _period),
 }
 
+_NEAR = 1.0  # dB below the best figure: a tenth more error
 _FSC = (
     "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
     "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
@@ -70,22 +71,22 @@ class TradeoffLayout:
     def labels(self, outcome: Outcome) -> tuple[str, ...]:
         return (outcome.trial.label,)
 
-    def columns(self, table: TrialTable) -> Sequence[Column]:
+    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
         settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
         return [
-            *(Column(name, _of_trial(name)) for name in ("group", "method", "views", "binning")),
-            *(Column(name, partial(_setting, name)) for name in settings),
-            Column("status", lambda o: o.status),
-            Column("seconds_asked", lambda o: o.trial.seconds_asked),
-            Column("seconds", lambda o: o.seconds, "s", "s", shown=lambda o: _time(o.seconds)),
-            Column("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: _time(o.cpu_seconds)),
-            Column("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0, lambda o: o.reached),
-            Column("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, _megabytes),
-            Column("gaussians_end", lambda o: o.gaussians),
+            *(TableColumn(name, _of_trial(name)) for name in ("group", "method", "views", "binning")),
+            *(TableColumn(name, partial(_setting, name)) for name in settings),
+            TableColumn("status", lambda o: o.status),
+            TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
+            TableColumn("seconds", lambda o: o.seconds, "s", "s", shown=lambda o: _time(o.seconds)),
+            TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: _time(o.cpu_seconds)),
+            TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0, lambda o: o.reached),
+            TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, _megabytes),
+            TableColumn("gaussians_end", lambda o: o.gaussians),
             *dose_columns(table),
             *(_figure(name, table.length_unit) for name in _names(table)),
-            Column("quality_db", lambda o: o.quality(table.by)),
-            Column("message", lambda o: o.message),
+            TableColumn("quality_db", lambda o: o.quality(table.by)),
+            TableColumn("message", lambda o: o.message),
         ]
 
     def marked(self, table: TrialTable) -> set[int]:
@@ -143,11 +144,11 @@ class TradeoffLayout:
 TRADEOFF = TradeoffLayout()
 
 
-def dose_columns(table: TrialTable) -> list[Column]:
+def dose_columns(table: TrialTable) -> list[TableColumn]:
     """The dose of each trial, where the light is known."""
     if (light := table.light) is None:
         return []
-    return [Column(name, partial(_dose, light, name)) for name in light.of(1)]
+    return [TableColumn(name, partial(_dose, light, name)) for name in light.of(1)]
 
 
 def _dose(light: Light, name: str, outcome: Outcome) -> float:
@@ -162,14 +163,14 @@ def _of_trial(name: str) -> Callable[[Outcome], Any]:
     return lambda outcome: getattr(outcome.trial, name)
 
 
-def _figure(name: str, length_unit: str) -> Column:
+def _figure(name: str, length_unit: str) -> TableColumn:
     figure = _FIGURES[name]
 
     def shown(outcome: Outcome) -> str:
         value = outcome.metrics.get(name)
         return "–" if value is None else figure.shown(value)
 
-    return Column(
+    return TableColumn(
         name, lambda o: o.metrics.get(name), figure.heading.format(length_unit), figure.short, 9, shown, metric=True
     )
 
@@ -208,7 +209,12 @@ def conclusions(table: TrialTable) -> list[str]:
     out = [f"Quality: {table.quality.words}, dB."]
     if not kept:
         return [*out, "No trial has both a time and a quality."]
-    first = compared[kept[0]]
+    first, best, pick = compared[kept[0]], compared[kept[-1]], kept[worth_its_time(table) or 0]
+    words = f"Best for its time: {compared[pick].trial.label}: {qualities[pick]:.2f} dB in {_duration(seconds[pick])}"
+    if pick != kept[-1]:
+        gain, more = qualities[kept[-1]] - qualities[pick], _duration(best.seconds - seconds[pick])
+        words += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
+    out = [f"{words}.", *out]
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for stretch in pareto.steps(kept, seconds, qualities):
         chance = "" if not table.quality.of_views else f" ± {table.chance(stretch.end, stretch.start):.2f}"
@@ -220,6 +226,13 @@ def conclusions(table: TrialTable) -> list[str]:
     if any("resolution" in outcome.metrics for outcome in compared):
         out.append(_FSC)
     return out
+
+
+def worth_its_time(table: TrialTable) -> int | None:
+    """Number on the front of time of the quickest trial within `_NEAR` of the best one; None without a front."""
+    front, qualities = table.front(TIME), table.qualities
+    near = [n for n, i in enumerate(front) if qualities[i] >= qualities[front[-1]] - _NEAR]
+    return near[0] if near else None
 
 
 def _level(table: TrialTable, last: int) -> list[str]:
@@ -243,4 +256,6 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
         table.front(cost),
         cost.axis,
         table.quality.axis,
+        cost.unit,
+        worth_its_time(table) if cost is TIME else None,
     )

@@ -28,7 +28,7 @@ MOTION: Mapping[str, tuple[bool | None, int]] = {"none": (False, 2), "learnt": (
 _TOYS = 12  # copies of the four views of a toy
 
 
-class JointFit(Protocol):
+class SharedFit(Protocol):
     """One fit of all views, which is no method of `recon.methods`; its fields are its settings."""
 
     @property
@@ -105,7 +105,7 @@ class MaterialsFit:
         return Data(lines, views, None, None, of_view=energies, sections=sections, states=(0, 1))
 
 
-JOINT: Mapping[str, Callable[..., JointFit]] = {"series": SeriesFit, "materials": MaterialsFit}
+JOINT: Mapping[str, Callable[..., SharedFit]] = {"series": SeriesFit, "materials": MaterialsFit}
 """By the name that a table gives to the method."""
 
 

@@ -29,7 +29,7 @@ def _nothing(outcome: Outcome) -> str:
 
 
 @dataclass(frozen=True)
-class Column:
+class TableColumn:
     """A column of a table.
 
     Attributes:
@@ -50,7 +50,7 @@ class Column:
     metric: bool = False
 
 
-class Layout(Protocol):
+class TableLayout(Protocol):
     """What a table compares, and how it is written.
 
     Attributes:
@@ -77,7 +77,7 @@ class Layout(Protocol):
     def labels(self, outcome: Outcome) -> tuple[str, ...]:
         """The first cells of a row."""
 
-    def columns(self, table: TrialTable) -> Sequence[Column]:
+    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
         """All others."""
 
     def marked(self, table: TrialTable) -> set[int]:
@@ -101,7 +101,7 @@ def said(outcome: Outcome) -> str:
     return f"{'left out' if outcome.trial.left_out else outcome.status}: {outcome.message}".rstrip(": ")
 
 
-def text(table: TrialTable, layout: Layout) -> str:
+def text(table: TrialTable, layout: TableLayout) -> str:
     """The table for people; * marks the rows that stand out."""
     columns = [column for column in layout.columns(table) if column.heading]
     columns = [c for c in columns if c.width] + [c for c in columns if not c.width]
@@ -128,7 +128,7 @@ def text(table: TrialTable, layout: Layout) -> str:
     return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
 
 
-def write_table(folder: Path, table: TrialTable, layout: Layout) -> None:
+def write_table(folder: Path, table: TrialTable, layout: TableLayout) -> None:
     """Write NAME.csv and NAME.json, each completely, in place of earlier ones."""
     record = {
         "format": f"splatline {layout.name} 1",
@@ -143,13 +143,13 @@ def write_table(folder: Path, table: TrialTable, layout: Layout) -> None:
     write_whole(folder / f"{layout.name}.csv", to_csv(table, layout), replace=True)
 
 
-def records(table: TrialTable, layout: Layout) -> list[dict[str, Any]]:
+def records(table: TrialTable, layout: TableLayout) -> list[dict[str, Any]]:
     """The values of each row by the names of its columns; None where they are not known."""
     columns = [column for column in layout.columns(table) if column.name]
     return [finite({column.name: column.value(outcome) for column in columns}) for outcome in table.outcomes]
 
 
-def to_csv(table: TrialTable, layout: Layout) -> str:
+def to_csv(table: TrialTable, layout: TableLayout) -> str:
     """One line for each trial; a value that is not known is empty."""
     out, rows = io.StringIO(), records(table, layout)
     writer = csv.DictWriter(out, list(rows[0]) if rows else [], lineterminator="\n")
@@ -158,7 +158,7 @@ def to_csv(table: TrialTable, layout: Layout) -> str:
     return out.getvalue()
 
 
-def write_page(folder: Path, table: TrialTable, layout: Layout, slices: SliceSheet) -> None:
+def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: SliceSheet) -> None:
     """Write the pictures that have data, and the page."""
     pictures = layout.pictures(table, slices)
     for name, picture in pictures:
@@ -166,7 +166,7 @@ def write_page(folder: Path, table: TrialTable, layout: Layout, slices: SliceShe
     write_whole(folder / layout.page, to_html(table, layout, [picture for _, picture in pictures]), replace=True)
 
 
-def to_html(table: TrialTable, layout: Layout, pictures: Sequence[Picture]) -> str:
+def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture]) -> str:
     columns, marked = [column for column in layout.columns(table) if column.heading], layout.marked(table)
     counts = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(
@@ -191,7 +191,7 @@ def to_html(table: TrialTable, layout: Layout, pictures: Sequence[Picture]) -> s
     )
 
 
-def event_of(table: TrialTable, layout: Layout, n: int, of: int, outcome: Outcome) -> TrialDone:
+def event_of(table: TrialTable, layout: TableLayout, n: int, of: int, outcome: Outcome) -> TrialDone:
     """A trial that has ended, the n-th of so many; `gaussians` are those at its start, as in its settings."""
     figures = outcome.trial.as_record() | {"cpu_seconds": outcome.cpu_seconds, "gaussians_end": outcome.gaussians}
     measured = {c.name: c.value(outcome) for c in layout.columns(table) if c.metric}

@@ -224,22 +224,39 @@ class Timed:
         return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
-def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
+def seconds_left(
+    done: Sequence[Timed], left: Sequence[Trial], cost: Callable[[Trial], float | None] = lambda trial: None
+) -> float | None:
     """How long the trials that are left will take, from those done; None before the first.
 
     Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
-    a method not yet seen is taken to cost what the others did on average, and one with a time to take it.
+    a method not yet seen takes its time in proportion to its cost, or what the others did on average, and one with a
+    time takes it.
+
+    Args:
+        cost: of a trial, to be compared among methods, too; None: not known.
     """
     if not done:
         return None
     fixed = sum(one.wall - one.working for one in done) / len(done)
     typical = sum(one.working for one in done) / len(done)
-    total = 0.0
+    costs = [
+        (one.working, known)
+        for one in done
+        if one.working > 0 and (known := cost(one.trial)) is not None and not one.trial.build().traits.direct
+    ]  # a direct method is over too soon to tell how fast this machine is
+    whole, total = sum(known for _, known in costs), 0.0
     for trial in left:
         if trial.seconds_asked is not None:
             total += fixed + trial.seconds_asked
             continue
         same = [one for one in done if one.trial.method == trial.method and one.working > 0]
         amount = sum(work(one.trial) for one in same)
-        total += fixed + (work(trial) * sum(one.working for one in same) / amount if amount > 0 else typical)
+        if amount > 0:
+            seconds = work(trial) * sum(one.working for one in same) / amount
+        elif whole > 0 and (unseen := cost(trial)) is not None:
+            seconds = unseen * sum(working for working, _ in costs) / whole
+        else:
+            seconds = typical
+        total += fixed + seconds
     return total

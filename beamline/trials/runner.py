@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,10 @@ from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.outcome import facts_of
 from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.readers.open import SourceOptions
+from beamline.trials.cost import expected_seconds
 from beamline.trials.data import Data, write_array
 from beamline.trials.launch import DATA, compile_kernels, run_trial
-from beamline.trials.layout import Layout, event_of, write_page, write_table
+from beamline.trials.layout import TableLayout, event_of, write_page, write_table
 from beamline.trials.plans import Timed, seconds_left
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
@@ -103,7 +105,7 @@ class Planned:
     """
 
     table: TrialTable
-    layout: Layout
+    layout: TableLayout
     started: Event
     reference: Trial | None = None
 
@@ -130,6 +132,7 @@ class _Rig:
     Attributes:
         work: folder with the data.
         end: by `now`, when the last trial must be done; inf: no limit.
+        cost: of a trial, to be compared with others.
     """
 
     work: Path
@@ -137,6 +140,7 @@ class _Rig:
     end: float
     now: Callable[[], float]
     emit: Callable[[Event], None]
+    cost: Callable[[Trial], float | None]
 
     @property
     def seconds(self) -> float | None:
@@ -185,10 +189,11 @@ def run_comparison(
     data, planned = plan(Warnings(sink, clock))
     emit(planned.started)
     table, layout, slices, truth = planned.table, planned.layout, SliceSheet(), data.truth
+    cost = partial(expected_seconds, geometry=data.geometry)
     with result_folder(folder) as work:
         data.save(work / DATA)
         del data
-        rig = _Rig(work, limits.seed, end, now, emit)
+        rig = _Rig(work, limits.seed, end, now, emit, cost)
         if planned.reference is not None:
             _add_reference(rig, planned.reference, truth, slices)
         if truth is not None:
@@ -248,16 +253,16 @@ def until_stopped(table: TrialTable, grown: Iterable[TrialTable], write: Callabl
     return table
 
 
-def _each(table: TrialTable, layout: Layout, rig: _Rig, slices: SliceSheet) -> Iterator[TrialTable]:
+def _each(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet) -> Iterator[TrialTable]:
     """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets those that the page shows."""
     begin, timed, todo = rig.now(), list[Timed](), table.todo
     for n, index in enumerate(todo):
         trial, left = table.outcomes[index].trial, rig.seconds
-        if left is not None and (refusal := _no_time(seconds_left(timed, [trial]) or 0.0, left)):
+        if left is not None and (refusal := _no_time(seconds_left(timed, [trial], rig.cost) or 0.0, left)):
             table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
             yield table
             continue
-        eta = seconds_left(timed, [table.outcomes[other].trial for other in todo[n:]])
+        eta = seconds_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.cost)
         eta = eta if eta is None or left is None else min(eta, left)
         rate = 60 * n / max(rig.now() - begin, 1e-9)
         rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta, rate))

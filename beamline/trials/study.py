@@ -22,7 +22,7 @@ from beamline.report.slice_sheet import SliceSheet
 from beamline.trials.data import Data
 from beamline.trials.figures import against_cost, figures_of_rows
 from beamline.trials.front import dose_columns
-from beamline.trials.layout import Column, records
+from beamline.trials.layout import TableColumn, records
 from beamline.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
@@ -152,22 +152,24 @@ class StudyLayout:
     def labels(self, outcome: Outcome) -> tuple[str, ...]:
         return _choice(outcome).label, outcome.trial.method
 
-    def columns(self, table: TrialTable) -> Sequence[Column]:
+    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
         timed, shown = table.timed, names(table)
         return [
-            Column("row", lambda o: _choice(o).label),
-            Column("method", lambda o: o.trial.method),
-            Column("views", lambda o: o.trial.views),
-            Column("window", lambda o: _choice(o).window),
-            Column("frames", lambda o: o.trial.frames),
+            TableColumn("row", lambda o: _choice(o).label),
+            TableColumn("method", lambda o: o.trial.method),
+            TableColumn("views", lambda o: o.trial.views),
+            TableColumn("window", lambda o: _choice(o).window),
+            TableColumn("frames", lambda o: o.trial.frames),
             *dose_columns(table),
-            Column("status", lambda o: o.status),
-            Column("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
-            Column("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
-            Column("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"),
-            Column("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
+            TableColumn("status", lambda o: o.status),
+            TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
+            TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
+            TableColumn(
+                "cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"
+            ),
+            TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
             *(_figure(name, name in shown) for name in _FIGURES),
-            Column("message", lambda o: o.message),
+            TableColumn("message", lambda o: o.message),
         ]
 
     def marked(self, table: TrialTable) -> set[int]:
@@ -228,14 +230,14 @@ def formatted(name: str, value: float) -> str:
     return "equal" if metric is METRICS["psnr"] and value > 0 else "undefined"
 
 
-def _figure(name: str, shown: bool) -> Column:
+def _figure(name: str, shown: bool) -> TableColumn:
     heading = _FIGURES[name][0]
 
     def in_words(outcome: Outcome) -> str:
         value = value_of(name, outcome)
         return "–" if value is None else formatted(name, value)
 
-    return Column(name, partial(value_of, name), heading * shown, heading, 12, in_words, metric=True)
+    return TableColumn(name, partial(value_of, name), heading * shown, heading, 12, in_words, metric=True)
 
 
 def _asked(outcome: Outcome) -> str:

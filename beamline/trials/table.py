@@ -22,7 +22,7 @@ class TrialCost:
 
     Attributes:
         name: in file names; `words`: in titles and captions.
-        axis: label with its unit; `scale`: from the value to that unit.
+        axis: label with its unit; `scale`: from the value to that unit; `unit`: alone.
         of: the cost of an outcome; NaN where it is not known.
     """
 
@@ -31,12 +31,14 @@ class TrialCost:
     axis: str
     scale: float
     of: Callable[[Outcome], float]
+    unit: str
 
 
-TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
+TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds, "s")
 MEMORY = TrialCost(
     "memory", "memory", "peak memory of the process (MB)", 1e-6,
     lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
+    "MB",
 )  # fmt: skip
 
 
@@ -80,7 +82,8 @@ class TrialTable:
     def dose(self) -> TrialCost:
         """Each frame of the scan that several views share is counted once."""
         a_frame, axis = dose_scale(self.light)
-        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.frames))
+        unit = "frames" if self.light is None else "photons" if self.light.gray is None else "Gy"
+        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.frames), unit)
 
     @property
     def compared(self) -> tuple[Outcome, ...]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from beamline.trials.joint import JOINT, JointFit
+from beamline.trials.joint import JOINT, SharedFit
 from beamline.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
@@ -46,7 +46,7 @@ class Trial:
     choice: ViewChoice | None = None
 
     @property
-    def joint(self) -> JointFit | None:
+    def joint(self) -> SharedFit | None:
         """The fit of all views that show several volumes; None: a method makes one volume of them.
 
         Raises:

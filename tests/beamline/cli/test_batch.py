@@ -50,6 +50,9 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
     Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes()[:2000])
     given = ("batch", "*scan.h5", "a/*.h5", "cut.h5", "--config", "recipe.yaml", "-o", "out")
 
+    planned = beamline(*given, "--dry-run")
+    assert planned.exit_code == 0 and "3, of which 3 wait" in planned.stdout and "not known before" in planned.stdout
+    assert not Path("out").exists()
     first = beamline(*given)
     assert first.exit_code == 5
     assert "1 of 3 scans failed" in first.output
@@ -67,6 +70,10 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
 
     before = (folder / "out" / "a_scan" / "recon.h5").stat().st_mtime_ns
     Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes())
+    rest = json.loads(beamline(*given, "--dry-run", "--json").stdout)
+    took = sum(float(table[name]["seconds"]) for name in ("a_scan", f"{folder.name}_scan"))
+    files = [path.stat().st_size for path in (Path("cut.h5"), Path("scan.h5"), Path("a/scan.h5"))]
+    assert rest["seconds"] == pytest.approx(took * files[0] / sum(files[1:]))
     second = beamline(*given)
     assert second.exit_code == 0, second.output
     assert _table(folder / "out")["cut"]["state"] == "done"

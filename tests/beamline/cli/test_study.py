@@ -165,6 +165,16 @@ def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
     assert slices.png(slices.labels("r2")).startswith(b"\x89PNG")
 
 
+def test_a_dry_run_names_the_rows_that_the_scan_has_and_writes_nothing(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "--dry-run")
+    assert result.exit_code == 0, result.output
+    rows = [line.rsplit(None, 2)[0] for line in result.stdout.splitlines() if ": fbp" in line]
+    assert rows == ["FBP of all views: fbp", "fixed, 90 views: fbp", "fixed, 45 views: fbp"]
+    assert "fixed, 180 views is left out" in result.stderr
+    assert not seen and not (folder / "many_fixed-views").exists()
+
+
 def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(folder / "many.h5", SCAN)
     monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))

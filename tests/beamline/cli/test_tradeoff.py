@@ -77,6 +77,20 @@ def test_a_sample_that_changes_is_compared_by_parts_and_in_one_fit(folder: Path,
     assert "--time 2" in record["command"] and record["trials"][2]["trial"]["parts"] == 4
 
 
+def test_a_dry_run_says_what_would_run_and_writes_nothing(folder: Path, quick_trials: list[Trial]) -> None:
+    asked = ("scan.h5", "--axis", "20.7", "--methods", "fbp,sirt", "--dry-run")
+    result = _beamline(*asked)
+    assert result.exit_code == 0, result.output
+    rows = [line.split() for line in result.stdout.splitlines() if line.startswith(("fbp", "sirt"))]
+    said = {" ".join(row[:-2]): (float(row[-2]), float(row[-1])) for row in rows}
+    assert list(said)[:2] == ["fbp, 27 views", "sirt, 27 views, 60 iterations"] and len(said) == 5
+    assert said["sirt, 27 views, 60 iterations"][0] >= said["sirt, 27 views, 20 iterations"][0]
+    assert "scan_tradeoff: tradeoff.csv" in result.stdout and not quick_trials
+    assert {path.name for path in folder.iterdir()} == {"scan.h5"}
+    event = json.loads(_beamline(*asked, "--json").stdout.splitlines()[-1])
+    assert event["event"] == "done" and [trial["label"] for trial in event["trials"]] == list(said)
+
+
 SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
 
 

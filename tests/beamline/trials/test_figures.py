@@ -35,24 +35,29 @@ def test_they_are_png() -> None:
 
 def test_every_trial_is_a_point_and_the_front_a_line_through_its_own(drawn: list[Figure]) -> None:
     points = [(FBP, 1.0, 20.0), (FEW, 20.0, 19.0), (FIT, 30.0, 25.0), (FEW, math.nan, 30.0)]
-    pareto_plot(points, [0, 2], "time (s)", "PSNR (dB)")
+    pareto_plot(points, [0, 2], "time (s)", "PSNR (dB)", "s", pick=1)
     axes = drawn[0].axes[0]
     places = [tuple(point) for dots in axes.collections for point in np.asarray(dots.get_offsets()).tolist()]
-    assert places == [(1.0, 20.0), (20.0, 19.0), (30.0, 25.0)]  # what is not finite has no place
+    assert places[:3] == [(1.0, 20.0), (20.0, 19.0), (30.0, 25.0)]  # what is not finite has no place
+    assert places[3:] == [(30.0, 25.0)]  # the ring
     (line,) = axes.lines
     np.testing.assert_array_equal(np.asarray(line.get_data()), [[1.0, 30.0], [20.0, 25.0]])
     assert [(note.get_text(), note.xy) for note in axes.texts] == [("1", (1.0, 20.0)), ("2", (30.0, 25.0))]  # type: ignore[attr-defined]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time (s)", "PSNR (dB)")
-    assert drawn[0].get_supxlabel() == f"1  {FBP.label}: 20.00 dB\n2  {FIT.label}: 25.00 dB"
+    assert drawn[0].get_supxlabel() == (
+        f"1  {FBP.label}: 20.00 dB, 1 s\n2  {FIT.label}: 25.00 dB, 30 s   (ring: best for its time)"
+    )
     names = [label.get_text() for label in drawn[0].legends[0].get_texts()]
     assert names == ["fbp", "r2", "baseline", "fewer views"]
 
 
 def test_what_is_far_below_the_best_is_counted_and_not_drawn(drawn: list[Figure]) -> None:
-    pareto_plot([(FBP, 1.0, 2.0), (FEW, 1.2, 3.0), (FIT, 2.0, 25.0)], [0, 1, 2], "time (s)", "PSNR (dB)")
+    pareto_plot([(FBP, 1.0, 2.0), (FEW, 1.2, 3.0), (FIT, 2.0, 25.0)], [2], "time (s)", "PSNR (dB)")
     axes = drawn[0].axes[0]
     assert axes.get_ylim()[0] == 13.0
     assert "2 more below 13.0 dB" in [note.get_text() for note in axes.texts]
+    pareto_plot([(FBP, 1.0, 2.0), (FEW, 1.2, 1.0), (FIT, 2.0, 25.0)], [0, 2], "time (s)", "PSNR (dB)")
+    assert drawn[1].axes[0].get_ylim()[0] == 1.5  # the front is whole
 
 
 @pytest.mark.parametrize(

@@ -62,10 +62,16 @@ def test_the_table_fits_into_120_columns(kind: str) -> None:
 def test_each_further_decibel_is_told_with_its_price() -> None:
     worse = replace(FIT, group="steps", settings={**FIT.settings, "steps": 50})
     table = _table(_done(BASE, 2.0, 20.0), _done(FIT, 12.0, 24.0), _done(worse, 13.0, 23.0))
-    quality, fastest, step = conclusions(table)
+    pick, quality, fastest, step = conclusions(table)
+    assert pick == "Best for its time: r2, 10 views, 100 steps, 2k Gaussians: 24.00 dB in 12 s."
     assert quality == "Quality: PSNR, dB."
     assert fastest == "Fastest: fbp, 10 views: 20.00 dB in 2 s."
     assert step == "+4.00 dB for 10 s more (2.5 s a dB): r2, 10 views, 100 steps, 2k Gaussians."
+    near = _done(worse, 4.0, 23.6)
+    assert conclusions(_table(_done(BASE, 2.0, 20.0), _done(FIT, 12.0, 24.0), near))[0] == (
+        "Best for its time: r2, 10 views, 50 steps, 2k Gaussians: 23.60 dB in 4 s; the best of all "
+        "(r2, 10 views, 100 steps, 2k Gaussians) has 0.40 dB more, for 8 s more."
+    )
     with_halves = replace(_done(BASE, 2.0, 20.0), metrics={"psnr": 20.0, "resolution": 0.6})
     assert conclusions(_table(with_halves))[-1].startswith("FSC: a smaller period is better among settings of one")
     assert conclusions(_table())[-1] == "No trial has both a time and a quality."
@@ -75,7 +81,7 @@ def test_a_held_out_residual_is_told_in_decibels_below_the_data() -> None:
     judged = Outcome(BASE, "done", 1.0, None, {"residual_held_out": 0.1})
     table = _table(judged, by="residual_held_out")
     assert table.qualities == [pytest.approx(20.0)]
-    assert "−20 log₁₀ of the held-out residual" in conclusions(table)[0]
+    assert "−20 log₁₀ of the held-out residual" in conclusions(table)[1]
     row = next(line for line in text(table, TRADEOFF).splitlines() if line.startswith("* fbp"))
     assert row.split()[-4:] == ["1.00", "n/a", "n/a", "0.1000"]  # s, CPU s, MB, residual: two are not known
 

@@ -104,7 +104,9 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
     assert seconds_left([], left) is None
     # Of a method never tried nothing better is known than the mean of what was.
     done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
-    assert seconds_left(done, [Trial("method", "fbp", 60)]) == pytest.approx(3 + 6)
+    other = Trial("method", "fbp", 60)
+    assert seconds_left(done, [other]) == pytest.approx(3 + 6)
+    assert seconds_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
 
 
 def test_where_the_time_of_a_trial_went() -> None:

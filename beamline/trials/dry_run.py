@@ -1,0 +1,129 @@
+"""Dry run: the trials of a comparison, the time and memory that they will take, and what they would write."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from beamline.core.machine import free_memory
+from beamline.core.sinks import Warn
+from beamline.core.text import count, size
+from beamline.trials.cost import expected_seconds, sweep_seconds
+from beamline.trials.data import Data
+from beamline.trials.runner import Planned
+from beamline.trials.trial import Trial
+from recon.assess.time_model import duration_text
+from recon.base.volume import Grid
+
+
+@dataclass(frozen=True)
+class ExpectedTrial:
+    """What a trial will take.
+
+    Attributes:
+        seconds: of processor time, with the start of its process; None: not known before it is tried.
+        memory: bytes of its process; None: not known.
+    """
+
+    label: str
+    seconds: float | None
+    memory: int | None
+
+
+@dataclass(frozen=True)
+class ExpectedRun:
+    """What a comparison will take.
+
+    Attributes:
+        folder: that it would write.
+        disk, free: bytes for the views while it runs, and bytes on that disk.
+        allowed: bytes of memory that are free.
+    """
+
+    stage: str
+    folder: Path
+    trials: tuple[ExpectedTrial, ...]
+    disk: int
+    free: int
+    allowed: int
+
+    @property
+    def seconds(self) -> float:
+        """Of all trials whose time is known."""
+        return sum(trial.seconds or 0.0 for trial in self.trials)
+
+    @property
+    def memory(self) -> int:
+        """Of the largest process."""
+        return max((trial.memory or 0 for trial in self.trials), default=0)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        width = max((len(trial.label) for trial in self.trials), default=5)
+        rows = [
+            f"{trial.label:<{width}}"
+            f"{'–' if trial.seconds is None else f'{trial.seconds:.3g}':>8}"
+            f"{'–' if trial.memory is None else f'{trial.memory / 1e6:.0f}':>8}"
+            for trial in self.trials
+        ]
+        unknown = sum(trial.seconds is None for trial in self.trials)
+        beside = f", beside {count(unknown, 'trial')} whose time is not known" if unknown else ""
+        return [
+            f"{'trial':<{width}}{'CPU s':>8}{'MB':>8}",
+            *rows,
+            "",
+            f"{'trials':<10}{len(self.trials)}",
+            f"{'time':<10}about {duration_text(self.seconds)} of processor time, with starts of processes{beside}",
+            f"{'memory':<10}{size(self.memory)} in the largest process; {size(self.allowed)} are free",
+            f"{'disk':<10}{size(self.disk)} for the views meanwhile; {size(self.free)} free",
+            f"{'output':<10}{self.folder}: {self.stage}.csv, {self.stage}.json, page and pictures (not written now)",
+        ]
+
+
+def dry_run(
+    plan: Callable[[Warn], tuple[Data, Planned]],
+    folder: Path,
+    warn: Warn,
+    now: Callable[[], float] = time.process_time,
+) -> ExpectedRun:
+    """Plan a comparison and measure a sweep; nothing is written. Times are rough: within a factor of two.
+
+    Args:
+        now: processor time of this process. What it has taken by now is the start of a process.
+
+    Raises:
+        ConfigError, DataError: the comparison would be refused.
+    """
+    start, own = now(), int(psutil.Process().memory_info().rss)
+    data, planned = plan(warn)
+    sweep = sweep_seconds(data.geometry, now)
+    table = planned.table
+    trials = [table.outcomes[n].trial for n in table.todo]
+    if planned.reference is not None:
+        trials = [planned.reference, *trials]
+
+    def expected(trial: Trial) -> ExpectedTrial:
+        seconds = expected_seconds(trial, data.geometry, sweep)
+        return ExpectedTrial(trial.label, None if seconds is None else start + seconds, _memory(trial, data, own))
+
+    free = shutil.disk_usage(folder.absolute().parent).free
+    return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())
+
+
+def _memory(trial: Trial, data: Data, own: int) -> int | None:
+    """Bytes: of a process that has loaded the libraries, the views twice (in their file and those used), the rest."""
+    if trial.joint is not None:
+        return None
+    method = trial.build()
+    coarse = data.geometry.binned(trial.binning)
+    return own + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
+
+
+def _bytes(data: Data) -> int:
+    arrays = (data.projections, data.weights, data.truth, data.held_out and data.held_out[0])
+    return sum(array.nbytes for array in arrays if array is not None)
