@@ -25,7 +25,7 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # share of the largest line integrals
 
 
-class Verdict(NamedTuple):
+class TrialVerdict(NamedTuple):
     """What trials tell.
 
     Attributes:
@@ -41,7 +41,7 @@ class Verdict(NamedTuple):
 
 def predicts_best(
     part: ReconProblem, methods: Sequence[Method], control: RunControl, order: Sequence[int] | None = None
-) -> Verdict:
+) -> TrialVerdict:
     """Which of the methods predicts unseen views best (one of eight is held out): `held_out.simplest` of them.
 
     A prior that one trial chooses by views held out is that of the next ones. A method that `control` cuts short is not
@@ -86,11 +86,11 @@ def predicts_best(
     listed = "; ".join(f"{methods[at].name} {residuals[at].mean():.4g}" for at in tried)
     if len(tried) + len(refused) < len(methods):
         if len(tried) < 2:
-            return Verdict(None, "stopped before the choice", {})
+            return TrialVerdict(None, "stopped before the choice", {})
         listed += "; the others not tried in time"
     if not tried:
         raise ValueError("; ".join(refused))
-    return Verdict(tried[simplest([residuals[at] for at in tried])], listed, decided)
+    return TrialVerdict(tried[simplest([residuals[at] for at in tried])], listed, decided)
 
 
 def _candidate(method: Method) -> Method:
