@@ -214,12 +214,19 @@ class ReadyScan:
     info: ScanInfo  # written into the file before the first frame
 
 
-def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remaining: Remaining = all_of) -> ReadyScan:
+def preflight(
+    config: Config,
+    instrument: ConnectedDevices,
+    runs: Path,
+    remaining: Remaining = all_of,
+    check_stop: Callable[[], None] = lambda: None,
+) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.
         remaining: the part of the plan that is still to be taken.
+        check_stop: called between pieces that take long, as kernels load; an exception from it ends them.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
@@ -236,7 +243,9 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
     info = _info(config, instrument, plan, timeline)
     monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
+    check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
+    check_stop()
     if instrument.simulated is not None:
         instrument.simulated.rehearse()
     return ReadyScan(plan, timeline, settings, timing, monitor, info)

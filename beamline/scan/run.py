@@ -114,7 +114,8 @@ def run_scan(
             connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
         )
         instrument.watch_moves(stop.refuse_abort)
-        ready = preflight(config, instrument, place, series.remaining if series else all_of)
+        still = series.remaining if series else all_of
+        ready = preflight(config, instrument, place, still, check_stop=lambda: _refuse_stop(stop))
         _refuse_stop(stop)
         others = [] if series else other_devices(place, ready)
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
