@@ -12,7 +12,7 @@ _PIXEL = base64.b64decode(
 )
 
 
-class _Blank:
+class BlankCanvas:
     """A canvas that takes any figure and writes a picture of one pixel."""
 
     def __init__(self, figure: object) -> None:
@@ -30,4 +30,4 @@ def real_pictures() -> None:
 @pytest.fixture(autouse=True)
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "real_pictures" not in request.fixturenames:
-        monkeypatch.setattr("beamline.report.figures.FigureCanvasAgg", _Blank)
+        monkeypatch.setattr("beamline.report.figures.FigureCanvasAgg", BlankCanvas)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -89,24 +90,7 @@ class Polyhedron:
 
     def hull(self) -> Hull:
         """Raises ValueError if all corners lie in a plane, or a corner lies inside the hull of the others."""
-        points = np.array(self.vertices, dtype=np.float64)
-        size = float(np.ptp(points, axis=0).max())
-        try:
-            found = ConvexHull(points / size)
-        except QhullError:
-            raise ValueError(
-                f"polyhedron: its {len(points)} vertices lie in a plane; a body needs four that do not"
-            ) from None
-        if others := set(range(len(points))) - set(found.vertices.tolist()):
-            which = f"vertex {min(others)} at {self.vertices[min(others)]} mm"
-            raise ValueError(
-                f"polyhedron: not convex: {which} is not a corner of the hull of all; leave it out, or describe the "
-                f"body by several convex ones"
-            )
-        # Faces of more than three corners come in triangles.
-        _, once = np.unique(np.round(found.equations / (1e3 * FLAT)) + 0.0, axis=0, return_index=True)
-        faces = found.equations[once]
-        return Hull(faces[:, :3], -faces[:, 3] * size, points)
+        return _hull(tuple(map(tuple, self.vertices)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +106,32 @@ class Hull:
     normals: NDArray[np.float64]
     distances: NDArray[np.float64]
     vertices: NDArray[np.float64]
+
+
+@lru_cache(4096)
+def _hull(vertices: tuple[tuple[float, ...], ...]) -> Hull:
+    """Of a convex polyhedron. A body that is moved or turned, as while a sample is packed, has the same one."""
+    points = np.array(vertices, dtype=np.float64)
+    size = float(np.ptp(points, axis=0).max())
+    try:
+        convex = ConvexHull(points / size)
+    except QhullError:
+        raise ValueError(
+            f"polyhedron: its {len(points)} vertices lie in a plane; a body needs four that do not"
+        ) from None
+    if others := set(range(len(points))) - set(convex.vertices.tolist()):
+        which = f"vertex {min(others)} at {vertices[min(others)]} mm"
+        raise ValueError(
+            f"polyhedron: not convex: {which} is not a corner of the hull of all; leave it out, or describe the "
+            f"body by several convex ones"
+        )
+    # Faces of more than three corners come in triangles.
+    _, once = np.unique(np.round(convex.equations / (1e3 * FLAT)) + 0.0, axis=0, return_index=True)
+    faces = convex.equations[once]
+    hull = Hull(faces[:, :3], -faces[:, 3] * size, points)
+    for array in (hull.normals, hull.distances, hull.vertices):
+        array.flags.writeable = False
+    return hull
 
 
 Solid = Cylinder | Ellipsoid | Box | Polyhedron

@@ -1,10 +1,11 @@
-"""Runs a command again and again in forks of this process, each with another fault of the disk (tests.faulty_disk).
+"""Runs commands again and again in forks of this process, each with another fault of the disk (tests.faulty_disk).
 
     LD_PRELOAD=faulty_disk.so FAULTY_DISK_PATTERN=out/ python -m tests.beamline.cli.disk_sweep FOLDER POINTS COMMAND...
 
-FOLDER is the current directory of the command, which writes to FOLDER/out. One JSON line a run: fault, write, exit
-code, stderr, the outputs by name with the SHA-256 of what does not change from run to run, and the files in them that
-are cut off. Trials of `tradeoff` and `study` are made up: they write a volume, in this process.
+FOLDER is the current directory of the commands, which write to FOLDER/out; each is one argument. One JSON line a run:
+command, fault, write, exit code, stderr, the outputs by name with the SHA-256 of what does not change from run to run,
+and the files in them that are cut off. Trials of `tradeoff` and `study` are made up: they write a volume, in this
+process. Figures are blank: they are drawn in memory, which no disk spoils.
 """
 
 from __future__ import annotations
@@ -19,13 +20,16 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
+from beamline.report import figures
 from beamline.trials import runner
 from beamline.trials.data import write_array
 from beamline.trials.trial import Outcome, Trial
+from tests.beamline.conftest import BlankCanvas
 
 _FAULTS = {
     "none": (0, 0, 0, 0),
@@ -99,17 +103,19 @@ def _digest_or_damaged(path: Path) -> str:
 
 
 def main() -> None:
-    folder, points, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    folder, points, commands = Path(sys.argv[1]), int(sys.argv[2]), [line.split() for line in sys.argv[3:]]
     library = ctypes.CDLL(os.environ["LD_PRELOAD"])
     cli = import_module("beamline.cli.main")
-    for module in _MODULES[command[0]].split():  # once, before the forks
-        import_module(f"beamline.{module}")
+    for words in commands:  # once, before the forks
+        for module in _MODULES[words[0]].split():
+            import_module(f"beamline.{module}")
     runner.run_trial = _made_up
     runner.compile_kernels = lambda *_: None
+    figures.FigureCanvasAgg = BlankCanvas  # type: ignore[misc]
     os.chdir(folder)
-    out, counted, writes = Path("out"), Path("count"), 0
+    out, counted = Path("out"), Path("count")
 
-    def run(fault: str, n: int) -> None:
+    def run(words: list[str], fault: str, n: int) -> None:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         child = os.fork()
@@ -118,24 +124,26 @@ def main() -> None:
                 os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
             kill, begin, once, error = _FAULTS[fault]
             library.faulty_disk_arm(*(ctypes.c_long(n * here) for here in (kill, begin, once)), error, 0)
-            sys.argv = ["beamline", *command]
+            sys.argv = ["beamline", *words]
             try:
                 cli.run()
             finally:
                 counted.write_text(str(library.faulty_disk_count()))
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-        hidden = sum(path.name.startswith(".") or path.name == "work" for path in out.rglob("*"))
-        found = {path.name: _digest_or_damaged(path) for path in sorted(out.iterdir()) if not path.name.startswith(".")}
-        said = Path("stderr").read_text()
-        line = {"fault": fault, "n": n, "code": code, "stderr": said, "outputs": found, "hidden": hidden}
+        line: dict[str, Any] = {"command": " ".join(words), "fault": fault, "n": n, "code": code}
+        line["stderr"] = Path("stderr").read_text()
+        line["hidden"] = sum(path.name.startswith(".") or path.name == "work" for path in out.rglob("*"))
+        kept = [path for path in sorted(out.iterdir()) if not path.name.startswith(".")]
+        line["outputs"] = {path.name: _digest_or_damaged(path) for path in kept}
         line["cut"] = [str(p) for p in out.rglob("[!.]*") if p.is_file() and "work" not in p.parts and not _whole(p)]
         print(json.dumps(line), flush=True)
 
-    run("none", 0)
-    writes = int(counted.read_text())
-    for fault in list(_FAULTS)[1:]:
-        for n in sorted(set(np.linspace(1, writes, min(points, writes)).astype(int).tolist())):
-            run(fault, n)
+    for words in commands:
+        run(words, "none", 0)
+        writes = int(counted.read_text())
+        for fault in list(_FAULTS)[1:]:
+            for n in sorted(set(np.linspace(1, writes, min(points, writes)).astype(int).tolist())):
+                run(words, fault, n)
 
 
 if __name__ == "__main__":

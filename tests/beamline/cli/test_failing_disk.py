@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,23 +21,27 @@ from tests import faulty_disk
 from tests.beamline.cli.small_scan import SCAN
 from tests.beamline.scans import write_exchange
 
-pytestmark = [faulty_disk.needed, pytest.mark.slow]
+Run = dict[str, Any]
 
-COMMANDS = {
-    "NXtomoproc": ("export volume.npy -o out/o.h5", {"o.h5"}),
-    "TIFF": ("export volume.h5 -o out/o.tif", {"o.tif"}),
-    "folder of TIFFs": ("export volume.h5 -o out/o", {"o"}),
-    "npy": ("export volume.h5 -o out/o.npy", {"o.npy"}),
-    "NRRD": ("export volume.h5 -o out/o.nrrd", {"o.nrrd"}),
-    "OME-Zarr": ("export volume.h5 -o out/o.zarr", {"o.zarr"}),
-    "ingested scan": ("ingest scan.h5 out/o.h5", {"o.h5"}),
-    "archive": ("archive ours.h5 -o out/o.h5", {"o.h5"}),
-    "reconstruction and report": ("recon scan.h5 -m fbp -o out/o.h5", {"o.h5", "o.html"}),
-    "labels": ("segment volume.h5 --crop none -o out/o.h5", {"o.h5", "o.csv", "o.png"}),
+pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.timeout(900)]
+
+FILES = {  # what each command writes
+    "export volume.npy -o out/o.h5": {"o.h5"},
+    "export volume.h5 -o out/o.tif": {"o.tif"},
+    "export volume.h5 -o out/o": {"o"},
+    "export volume.h5 -o out/o.npy": {"o.npy"},
+    "export volume.h5 -o out/o.nrrd": {"o.nrrd"},
+    "export volume.h5 -o out/o.zarr": {"o.zarr"},
+    "ingest scan.h5 out/o.h5": {"o.h5"},
+    "archive ours.h5 -o out/o.h5": {"o.h5"},
 }
-FOLDERS = {  # of results, which keep those of the trials that were done
-    "tradeoff": ("tradeoff scan.h5 --methods fbp,sirt -o out/o", 5),
-    "study": ("study fixed-views views.h5 -m fbp -m sirt -o out/o", 2),
+RESULTS = {
+    "recon scan.h5 -m fbp -o out/o.h5": {"o.h5", "o.html"},
+    "segment volume.h5 --crop none -o out/o.h5": {"o.h5", "o.csv", "o.png"},
+}
+FOLDERS = {  # of results, which keep those of the trials that were done: so many
+    "tradeoff scan.h5 --methods fbp,sirt -o out/o": 5,
+    "study fixed-views views.h5 -m fbp -m sirt -o out/o": 2,
 }
 LOG = "recon scan.h5 -m fbp --no-report --log out/o.txt -o out/o.h5"
 POINTS = 6  # writes of each fault; there are up to 315
@@ -66,52 +71,53 @@ def inputs(tmp_path: Path, rng: np.random.Generator) -> Path:
     return tmp_path
 
 
-def _swept(inputs: Path, command: str, watched: str = "/out/") -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The run without a fault, and those with one."""
+def _swept(inputs: Path, commands: Iterable[str], watched: str = "/out/") -> list[tuple[Run, list[Run]]]:
+    """Of each command the run without a fault, and those with one."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *command.split()],
+        [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *commands],
         env=os.environ | faulty_disk.environment(watched) | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=600, check=True,
+        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=800, check=True,
     )  # fmt: skip
-    clean, *runs = [json.loads(line) for line in done.stdout.splitlines()]
-    assert clean["code"] == 0 and len(runs) >= 3 * 4, clean
-    for run in runs:
-        assert "Traceback" not in run["stderr"] and "ignored" not in run["stderr"], run
-    return clean, runs
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    swept = []
+    for command in commands:
+        clean, *runs = [line for line in lines if line["command"] == command]
+        assert clean["code"] == 0 and len(runs) >= 3 * 4, clean
+        for run in runs:
+            assert "Traceback" not in run["stderr"] and "ignored" not in run["stderr"], run
+        swept.append((clean, runs))
+    return swept
 
 
-@pytest.mark.parametrize("kind", COMMANDS)
-def test_an_output_is_right_or_absent(inputs: Path, kind: str) -> None:
-    command, outputs = COMMANDS[kind]
-    clean, runs = _swept(inputs, command)
-    assert set(clean["outputs"]) == outputs, clean
-    for run in runs:
-        right = run["outputs"] == clean["outputs"]
-        if run["fault"] == "kill":  # of several outputs some may be there, and these are right
-            assert run["code"] == -9 and run["outputs"].items() <= clean["outputs"].items(), run
-            continue
-        said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
-        assert (run["code"], len(said)) in ((0, 0), (5, 1)) and run["hidden"] == 0, run
-        assert right if run["code"] == 0 else not run["outputs"], run
+@pytest.mark.parametrize("commands", [FILES, RESULTS], ids=["files", "results"])
+def test_an_output_is_right_or_absent(inputs: Path, commands: dict[str, set[str]]) -> None:
+    for (clean, runs), outputs in zip(_swept(inputs, commands), commands.values(), strict=True):
+        assert set(clean["outputs"]) == outputs, clean
+        for run in runs:
+            right = run["outputs"] == clean["outputs"]
+            if run["fault"] == "kill":  # of several outputs some may be there, and these are right
+                assert run["code"] == -9 and run["outputs"].items() <= clean["outputs"].items(), run
+                continue
+            said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
+            assert (run["code"], len(said)) in ((0, 0), (5, 1)) and run["hidden"] == 0, run
+            assert right if run["code"] == 0 else not run["outputs"], run
 
 
-@pytest.mark.parametrize("kind", FOLDERS)
-def test_a_folder_of_results_holds_whole_files_and_the_trials_done(inputs: Path, kind: str) -> None:
-    command, trials = FOLDERS[kind]
-    clean, runs = _swept(inputs, command)
-    assert set(clean["outputs"]) == {"o"}
-    for run in runs:
-        assert not run["cut"], run
-        if run["fault"] == "kill":
-            assert run["code"] == -9, run
-            continue
-        said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
-        assert (run["code"], len(said), run["hidden"]) == (5, 1, 0) and "could not be written" in said[0], run
-        assert run["outputs"] or f"1/{trials} " not in run["stderr"], run
+def test_a_folder_of_results_holds_whole_files_and_the_trials_done(inputs: Path) -> None:
+    for (clean, runs), trials in zip(_swept(inputs, FOLDERS), FOLDERS.values(), strict=True):
+        assert set(clean["outputs"]) == {"o"}
+        for run in runs:
+            assert not run["cut"], run
+            if run["fault"] == "kill":
+                assert run["code"] == -9, run
+                continue
+            said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
+            assert (run["code"], len(said), run["hidden"]) == (5, 1, 0) and "could not be written" in said[0], run
+            assert run["outputs"] or f"1/{trials} " not in run["stderr"], run
 
 
 def test_a_volume_is_right_where_its_log_is_lost(inputs: Path) -> None:
-    clean, runs = _swept(inputs, LOG, "/out/o.txt")
+    ((clean, runs),) = _swept(inputs, [LOG], "/out/o.txt")
     for run in runs:
         if run["fault"] == "kill":
             assert run["code"] == -9, run

@@ -1,11 +1,19 @@
-"""Kill -9 at random moments of a running scan: every frame that was committed is there, whole and at its angle."""
+"""Kill -9 at random moments of a running scan: every frame that was committed is there, whole and at its angle.
+
+What a kill leaves is what had reached the file system by then. So one scan stands for many kills: it is stopped
+(SIGSTOP), its files are copied, it goes on, and is killed in the end.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
+import signal
 import sys
 import time
+from collections.abc import Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +31,7 @@ from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 from tests.beamline.ran import small
 
-VIEWS, SECONDS = 200, 0.002  # s a frame, of real time
+VIEWS, FRAMES, SECONDS = 200, 207, 0.002  # s a frame, of real time
 WORDS = (f"scan.angles.views={VIEWS}", "scan.period_s=0.05")
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process that is forked is killed")
@@ -35,16 +43,15 @@ def _no_pause_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder, "BacklogGuard", lambda *_: lambda waiting: None)
 
 
-def _scan(runs: Path, step: bool) -> None:
-    instrument = FakeInstrument(on_frame=lambda number: time.sleep(SECONDS))
+def _scan(runs: Path, step: bool, taken: Connection) -> None:
+    """It sends a byte for each frame."""
+
+    def on_frame(number: int) -> None:
+        os.write(taken.fileno(), b".")
+        time.sleep(SECONDS)
+
+    instrument = FakeInstrument(on_frame=on_frame)
     run_scan(small(*WORDS, f"scan.mode={'step' if step else 'fly'}"), runs, instrument=instrument.connected())
-
-
-def _seconds(runs: Path, step: bool) -> float:
-    """That a scan takes here, so that kills fall into it on any machine."""
-    begin = time.monotonic()
-    _scan(runs, step)
-    return time.monotonic() - begin
 
 
 def _assert_frames(path: Path, one_part: bool = True) -> int:
@@ -62,42 +69,62 @@ def _assert_frames(path: Path, one_part: bool = True) -> int:
     return len(frames)
 
 
-def _killed(runs: Path, seconds: float, step: bool) -> Path | None:
-    """The folder of a scan that was killed after so many s; None where it had none yet."""
-    process = multiprocessing.get_context("fork").Process(target=_scan, args=(runs, step))
+def _killed(folder: Path, moments: Sequence[float], step: bool) -> list[Path]:
+    """The folders of runs of a scan as kills leave them, where there is one yet.
+
+    A moment is the number of a frame, and for how much of a frame's time it has been there; they rise. Beyond the last
+    frame the file is closed.
+    """
+    runs, left, taken = folder / "runs", list[Path](), 0
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    process = multiprocessing.get_context("fork").Process(target=_scan, args=(runs, step, theirs))
     process.start()
-    time.sleep(seconds)
-    process.kill()
+    theirs.close()
+    assert process.pid is not None
+    for k, moment in enumerate(moments):
+        while taken < min(int(moment), FRAMES):
+            heard = len(os.read(ours.fileno(), min(int(moment), FRAMES) - taken))
+            assert heard, "the scan has failed"
+            taken += heard
+        time.sleep((moment - taken) * SECONDS)
+        os.kill(process.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        if k == len(moments) - 1:
+            process.kill()
+        if runs.exists():
+            left += shutil.copytree(runs, folder / str(k)).iterdir()
+        os.kill(process.pid, signal.SIGCONT)
     process.join()
-    for file in runs.rglob("*"):
+    ours.close()
+    for file in folder.rglob("*"):
         os.utime(file, (time.time() - 2 * QUIET,) * 2)
-    return next(iter(runs.glob("*")), None)
+    return left
 
 
-def kills(folder: Path, n: int, seed: int) -> dict[str, int]:
-    rng, found = np.random.default_rng(seed), dict.fromkeys(("recovered", "whole", "frames", "none", "resumed"), 0)
-    _scan(folder / "warm", step=False)
-    whole = [_seconds(folder / f"whole{step:d}", step) for step in (False, True)]
-    for k in range(n):
-        step, runs = bool(k % 2), folder / str(k)
-        run = _killed(runs, float(rng.uniform(0.02, whole[step])), step)
-        try:
-            done = recover_run(run)[0] if run is not None else []
-        except DataError:
-            assert run is not None
-            assert not (events := run / "events.jsonl").exists() or '"event": "frame"' not in events.read_text()
-            done = []
-        if not done or not done[0].frames:
-            found["none"] += 1
-            continue
-        assert run is not None
-        assert done[0].dropped <= StorageSection().flush_every  # frames come faster than they are written
-        assert _assert_frames(done[0].path) == done[0].frames
-        found["recovered" if done[0].changed else "whole"] += 1
-        found["frames"] += done[0].frames
-        if k % 4 == 0:
-            found["resumed"] += _gone_on(run)
-    return found
+def kills(folder: Path, n: int, scans: int, seed: int, steps: Sequence[bool]) -> dict[str, int]:
+    """Of so many scans, and n moments of each; the scan is taken up again after one in eight."""
+    rng = np.random.default_rng(seed)
+    counted = dict.fromkeys(("recovered", "whole", "frames", "none", "resumed"), 0)
+    for scan in range(scans):
+        moments = np.sort(rng.uniform(0, 1.1 * FRAMES, n))
+        runs = _killed(folder / str(scan), moments.tolist(), steps[scan % len(steps)])
+        counted["none"] += n - len(runs)
+        for k, run in enumerate(runs):
+            try:
+                done = recover_run(run)[0]
+            except DataError:
+                assert not (events := run / "events.jsonl").exists() or '"event": "frame"' not in events.read_text()
+                done = []
+            if not done or not done[0].frames:
+                counted["none"] += 1
+                continue
+            assert done[0].dropped <= StorageSection().flush_every  # frames come faster than they are written
+            assert _assert_frames(done[0].path) == done[0].frames
+            counted["recovered" if done[0].changed else "whole"] += 1
+            counted["frames"] += done[0].frames
+            if k % 8 == 0:
+                counted["resumed"] += _gone_on(run)
+    return counted
 
 
 def _gone_on(run: Path) -> bool:
@@ -118,13 +145,13 @@ def _gone_on(run: Path) -> bool:
 
 
 def test_a_few_kills(tmp_path: Path) -> None:
-    found = kills(tmp_path, 3, 1)
-    assert found["recovered"] + found["whole"] + found["none"] == 3
+    counted = kills(tmp_path, 3, 1, 1, [False])
+    assert counted["recovered"] + counted["whole"] + counted["none"] == 3
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_two_hundred_kills(tmp_path: Path) -> None:
-    found = kills(tmp_path, 200, 0)
-    print(found)
-    assert found["recovered"] >= 100
+    counted = kills(tmp_path, 25, 8, 0, [False, True])
+    print(counted)
+    assert counted["recovered"] >= 100 and counted["resumed"] >= 10
