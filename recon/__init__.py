@@ -15,7 +15,10 @@ from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
+from recon.compiled import use_compiled_kernels
 from recon.methods import REGISTRY
+
+use_compiled_kernels()  # before numba is imported, which happens where something is computed
 
 # libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores
 # (a scan and its live reconstruction) slow each other down twentyfold.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -11,35 +12,31 @@ from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import ChoosingMethod, Method, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.methods import with_settings
-from recon.splatting.finish import SWEEPS
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
 from recon.trials import of_views, part_of, predicts_best
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.pnp_dct import PnpDct
 
 
 def _candidates() -> tuple[Method, ...]:
-    # OS-SIRT-TV, a third of the cost, was nowhere the best by more than 0.02 dB (docs/notes/exploration.md).
-    return R2(), FistaTv(), Fbp()
+    return Fbp(), FistaTv(), PnpDct(), R2()
 
 
 @dataclass(frozen=True, eq=False)
 class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
-    The part is a slab of 32 rows where most matter is, with 8 rows where the sample is weakest. A cone's part is the
-    rows in its middle, or all rows at half the resolution. One of eight views is held out. There is no trial with
-    fewer than 16 views: the first candidate takes them. A sample wider than the field, which only a fit models, is not
-    tried either. A volume that is too smooth misses the edges of unseen views, one that follows the noise misses them
-    by its noise; so neither is preferred. Where methods are level, the first one is taken that leaves no structure in
-    its own views. docs/choosing.md has all rules and their reasons.
+    The part is a slab of 32 rows where most matter is. A cone's part is the rows in its middle, or all rows at half the
+    resolution. One of eight views is held out. Of methods that predict as well within one standard error, view by view,
+    the first is taken, which is the simplest and cheapest (`recon.voxels.held_out.simplest`). There is no trial with
+    fewer than 16 views, or of a sample wider than the field: the last one takes these. docs/choosing.md has reasons.
 
     Attributes:
-        candidates: the methods, by preference.
+        candidates: the methods, the simplest and cheapest first.
     """
 
     name: ClassVar[str] = AUTO
@@ -50,21 +47,6 @@ class Auto:
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
-    @property
-    def longer_fit(self) -> Method | None:
-        """A fit with more sweeps, tried if the fit is not taken, and then preferred to all others.
-
-        A fit chooses its sweeps by views that it already knows, so it makes too few if it is far off.
-        """
-        first = self.candidates[0]
-        return with_settings(first, {"finish": 3 * SWEEPS}) if getattr(first, "finish", 0) is None else None
-
-    @property
-    def methods(self) -> tuple[Method, ...]:
-        """All, by preference."""
-        first, *others = self.candidates
-        return self.candidates if self.longer_fit is None else (first, self.longer_fit, *others)
-
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
 
@@ -72,26 +54,30 @@ class Auto:
             ValueError: no candidate takes these views or data.
         """
         decide = control.decide or Decisions(problem.seed)
-        at, because = decide("method", lambda: self.choose(problem, control))
-        chosen = self.methods[at]
+        at, because, decided = decide("method", lambda: self.choose(problem, control))
+        decide.preset(decided)
+        chosen = self.candidates[at]
+        if decided and isinstance(chosen, ChoosingMethod):  # its rivals were tried
+            chosen = chosen.as_candidate()
         device = problem.device if chosen.traits.device else "cpu"
-        found = chosen.run(replace(problem, device=device), control)
+        found = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
         return replace(found, settings=settings, method=chosen.name)
 
-    def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
-        """The chosen method and the reason."""
-        wider = [n for n, method in enumerate(self.methods) if method.traits.any_grid]
+    def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str, Mapping[str, Sequence[Any]]]:
+        """Number of the chosen method, the reason, and the decisions on its prior."""
+        last = len(self.candidates) - 1
+        wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
         if wider and is_wider(problem):
-            name = self.methods[wider[0]].name
-            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it"
+            name = self.candidates[wider[0]].name
+            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it", {}
         part, where = part_of(problem)
         if part is None:
-            return 0, where
-        at, residuals = predicts_best(part, self.methods, control, None if self.longer_fit is None else 1)
+            return last, where, {}
+        at, residuals, decided = predicts_best(part, self.candidates, control)
         if at is None:
-            return 0, residuals
-        return at, f"residual of views held out, {where}: {residuals}"
+            return last, residuals, {}
+        return at, f"residual of views held out, {where}: {residuals}", decided
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))

@@ -181,8 +181,6 @@ def _refit(method: Method) -> _Refit:
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:
     """The decisions of a run that refits follow; a weight that changed along the run stays the last one."""
     kept = {name: list(decided[name]) for name in _OF_RUN if name in decided}
-    if any(decided.get("other", ())):  # a finish took its second attempt
-        kept |= {name: kept[name][-1:] for name in ("units", "weight") if name in kept}
     return {name: sweeps * made[-1:] if name == "balance" else made for name, made in kept.items()}
 
 

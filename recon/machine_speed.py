@@ -18,7 +18,7 @@ from recon.splatting.initialise import MATTER, count_for, density_unit, first_vo
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out_weight import busiest_rows, choice_sweeps
+from recon.voxels.held_out import busiest_rows, choice_sweeps
 
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60

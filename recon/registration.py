@@ -13,7 +13,7 @@ from recon.base.arrays import F64
 from recon.base.binning import bin_views
 from recon.energy_fit import EnergyViews
 from recon.voxels.displacement import Displacement, displaced, displacements, judge, measured_unmagnified, unmagnified
-from recon.voxels.held_out_weight import busiest_rows
+from recon.voxels.held_out import busiest_rows
 
 _LEVELS = ((64, 2), (160, 4), (320, 2))  # columns, at most, and volumes of all views
 _ROWS = 32  # binned rows looked at

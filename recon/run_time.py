@@ -11,15 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recon.base.arrays import F32, F64
-from recon.base.choices import SHORT_STEPS
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Method, RunControl, candidates_of
+from recon.base.method import ChoosingMethod, Clock, Method, RunControl, candidates_of
 from recon.base.volume import Grid
 from recon.fields.train import FieldMethod
 from recon.methods import with_settings
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, joined_for
@@ -27,9 +25,10 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
 from recon.voxels.fbp import fbp_nanoseconds
-from recon.voxels.held_out_weight import CHOICE_SWEEPS, LEAST_VIEWS
+from recon.voxels.held_out import CHOICE_SWEEPS, LEAST_VIEWS, TRIAL_ROWS
 from recon.voxels.iterative import IterativeMethod, PreparedMethod
 from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.projector import Projector
 
 Decided = Mapping[str, Sequence[Any]]
@@ -45,8 +44,6 @@ _FITS, _FITTED_VIEWS = ((96, 16), (160, 48)), 24  # columns and rows of small fi
 _FBP_COLS, _FBP_VIEWS = 512, 180
 _STEPS = 12, 32  # of small fits, whose views have all been seen after the first number
 _FIELD_STEPS = 3  # of a small fit of a neural field
-# Sweeps of a finish, and of all of its trials, where views held out choose them: either 8 and about 104, or 24 and 80.
-_FINISH = 2 * SWEEPS, 92
 
 Size = tuple[int, int, int]  # views, columns, rows
 
@@ -92,7 +89,7 @@ class RunTime(NamedTuple):
 
 
 def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
-    """Seconds that the method takes, without reading and correction; `auto` is taken to choose its first candidate.
+    """Seconds that the method takes, without reading and correction; `auto` is taken to choose its last candidate.
 
     Small runs are made of the scan's own beam, with its lean, its exposures and as many rows, if they are few.
     Iterations cost views times voxels, plus voxels for their work on the volume alone. A weight of total variation is
@@ -112,11 +109,13 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
             seconds = _of_direct(method, extent, now)
         return RunTime(seconds, seconds)
     first = Extent(extent.geometry, [min(32, max(extent.heights))])
-    known = not extent.geometry.is_cone  # the weight that the first trial finds is that of the others
-    tried = [first, *(replace(first, decided=known) for _ in candidates[1:])]
-    parts = [run_seconds(one, part, now) for one, part in zip(candidates, tried, strict=True)]
-    parts.append(run_seconds(candidates[0], extent, now))
+    parts = [run_seconds(_candidate(one), first, now) for one in candidates]
+    parts.append(run_seconds(_candidate(candidates[-1]), replace(extent, decided=True), now))
     return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
+
+
+def _candidate(method: Method) -> Method:
+    return method.as_candidate() if isinstance(method, ChoosingMethod) else method
 
 
 def _of_iterations(method: Method, extent: Extent, now: Clock, sweeps: int, trials: int = CHOICE_SWEEPS) -> float:
@@ -206,23 +205,27 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     slope = max(more - less, 0.0) / (many - few) if many > few else less / few
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
     cone = extent.geometry.is_cone
-    seconds, may_end_early = 0.0, not cone and extent.views >= LEAST_VIEWS
+    seconds, may_end_early = 0.0, extent.views >= LEAST_VIEWS
     for height in extent.heights:
         field = Grid((height, extent.cols, extent.cols))
         first = count_for(field, cone)
         count = first if given is None else given * height / extent.slices
         joined = method.fit.joined_pixels or joined_for(field, cone, max(count, first), (height, extent.cols))
-        may_end_early &= joined == 1
         seconds += max(less + slope * (_work(math.prod(field.shape) / joined**3, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0
-    if not may_end_early:  # no trial of the finish ends such a fit at step 100
-        fewest = min(planned, max(fewest, SHORT_STEPS))
+    if not may_end_early:  # no view can be held out
+        fewest = planned
     most = method.seconds if method.seconds is not None else planned * seconds * grown
     least = min(most, fewest * seconds * (grown if fewest == planned else 1))  # it ends before Gaussians are added
+    if fewest < planned:  # the fit of the trial
+        trial = planned * seconds * min(1.0, TRIAL_ROWS / extent.slices)
+        most, least = most + trial, least + trial
     beside = _of_direct(Fbp(), extent, now)
     if method.finish != 0:
-        sweeps, trials = _FINISH if method.finish is None else (method.finish, CHOICE_SWEEPS)
+        patches = PnpDct()
+        by_default = patches.first_sweeps + patches.iterations, patches.trial_sweeps
+        sweeps, trials = by_default if method.finish is None else (method.finish, CHOICE_SWEEPS)
         beside += _of_iterations(FistaTv(), extent, now, sweeps, trials)
     return RunTime(most + beside, least + beside)
 

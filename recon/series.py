@@ -21,7 +21,7 @@ from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
-from recon.voxels.held_out_weight import ONE_IN, beyond_chance, busiest_rows, slab_of
+from recon.voxels.held_out import ONE_IN, beyond_chance, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 

@@ -17,7 +17,7 @@ from recon.base.arrays import F32, F64
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
+from recon.voxels.held_out import ONE_IN, busiest_rows, slab_of
 
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray

@@ -20,12 +20,14 @@ from recon.kernels.cpu.footprints import HIDDEN
 from recon.kernels.cpu.losses import total_variation
 from recon.reconstruction import reconstruct
 from recon.splatting.finish import finish
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.view_weights import cone_weights, missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
@@ -63,8 +65,9 @@ def warm_up(
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
-    with _counted(on_kernel or (lambda n: None)):
-        reconstruct(data, views, method.toy(), device=device, use=DataUse(weights))
+    with counted(on_kernel or (lambda n: None)):
+        for one in (method, PnpDct()) if isinstance(method, FitMethod) else (method,):  # a fit may end with patches
+            reconstruct(data, views, one.toy(), device=device if one is method else "cpu", use=DataUse(weights))
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
 
@@ -98,7 +101,9 @@ def _rows(n: int) -> F32:
 
 
 @contextmanager
-def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
+def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
+    """Call `on_kernel` with the number of functions compiled so far, after each."""
+
     class Counter(event.Listener):
         n = 0
 

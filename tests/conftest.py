@@ -11,10 +11,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import settings
+
+import recon  # noqa: F401 - before numba: it says what processor numba compiles for
+
+# isort: split
+import numba
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
 # No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
@@ -73,6 +77,21 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         codes = [half.wait() for half in halves]
         if any(codes):
             pytest.exit("a kernel cannot be compiled, or the simulated instrument cannot scan: see above", 1)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Of the whole suite, files without a test of the kind that is asked for are not imported, as most of the time of
+    collecting is imports: measurements, and, where slow tests are asked for, files that name none."""
+    if [Path(argument).name for argument in config.args] != ["tests"]:
+        return None
+    asked = config.option.markexpr
+    if "not bench" in asked and collection_path == Path(__file__).parent / "bench":
+        return True
+    if not asked.startswith("slow") or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
 
 
 def pytest_collection_finish() -> None:

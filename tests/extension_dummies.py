@@ -63,11 +63,12 @@ import numpy as np
 import recon
 from click.testing import CliRunner
 from beamline.cli.method_options import takers
+from beamline.cli.options import Owner
 from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
 from beamline.reconstruct.outcome import label_of
-from beamline.tradeoff.figures import pareto_plot
-from beamline.tradeoff.trials import plan
+from beamline.trials.figures import pareto_plot
+from beamline.trials.plans import plan
 from recon import methods
 
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))
@@ -81,7 +82,7 @@ assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers("iterations") and "grey" not in takers("tv_weight")
+assert "grey" in takers(Owner("iterations")) and "grey" not in takers(Owner("tv_weight"))
 assert label_of("grey") == "Grey"
 """,
 )
@@ -349,11 +350,11 @@ assert wire.transmit() == b"0007"
 
 STEP = Extension(
     {
-        "beamline/projections/steps/lift.py": """
+        "beamline/projections/corrections/lift.py": """
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import StepDone, StepMemory, option
+from beamline.projections.step import StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -378,7 +379,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    (("beamline/projections/registry.py", '    "Hardening": "hardening",', '    "Lift": "lift",'),),
     """
 from pathlib import Path
 
@@ -387,9 +388,9 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.lift import Lift
-from beamline.projections.steps.registry import recorded
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.lift import Lift
+from beamline.projections.registry import in_order, recorded
 from beamline.storage.readers.open import SourceOptions, open_scan
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -399,7 +400,7 @@ with open_scan(SourceOptions(path)) as source:
     plain, lifted = (prepare_projections(source, each, print) for each in chosen)
 np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
 assert lifted.done["lift"].said == "Lifted by 0.5."
-found = recorded(chosen[1].in_order, lifted.done)
+found = recorded(in_order(chosen[1]), lifted.done)
 assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
 
 def run(*options):

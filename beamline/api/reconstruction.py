@@ -55,7 +55,7 @@ def reconstruct(
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.
         selection: other options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
-        `beamline.projections.steps`; the arguments above take precedence.
+        `beamline.projections.corrections`; the arguments above take precedence.
         output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
             A scan that does not fit into the memory needs one.
         say: gets a sentence on what happens; None: nobody does.

@@ -62,6 +62,7 @@ class _Frames(DetectorAcquireLogic):
         self._runs, self._stop, self._ending = runs or Path(config.storage.folder), Event(), asyncio.Lock()
         self._writer: NXtomoWriter | None = None
         self._task: asyncio.Task[None] | None = None
+        self._lacking = range(0)  # triggers without a frame, of those asked for last
         self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
@@ -76,18 +77,23 @@ class _Frames(DetectorAcquireLogic):
     async def new_file(self) -> tuple[Path, tuple[int, int]]:
         """In a run folder of its own, and the shape of its frames."""
         await self.ensure_stopped()
-        config, camera = self._config, self._devices.camera
-        folder = create_run_folder(self._runs, config.sample.name, self._clock.now())
-        info, bin_, shape = scan_info(config, self._instrument), config.storage.preview_bin, camera.timing.shape
-        info = replace(info, beam_unit=None)  # nobody reads the beam monitor meanwhile
-        self._writer = NXtomoWriter(folder / SCAN, info, shape, clock=self._clock, preview_bin=bin_)
+        self._writer, self._lacking = await asyncio.to_thread(self._created), range(0)
         self._set_rows(0)
-        return self._writer.path, shape
+        return self._writer.path, self._devices.camera.timing.shape
+
+    def _created(self) -> NXtomoWriter:
+        config, shape = self._config, self._devices.camera.timing.shape
+        folder = create_run_folder(self._runs, config.sample.name, self._clock.now())
+        info = replace(scan_info(config, self._instrument), beam_unit=None)  # nobody reads the beam monitor meanwhile
+        bin_ = config.storage.preview_bin
+        return NXtomoWriter(folder / SCAN, info, shape, clock=self._clock, preview_bin=bin_)
 
     async def start_acquiring(self) -> None:
         """Bring shutter and sample to their places, arm, and take frames in the background."""
         kind, loop = FrameKind[(await self.kind.get_value()).name], asyncio.get_running_loop()
         self._stop.clear()
+        rows = 0 if self._writer is None else self._writer.rows
+        self._lacking = range(rows, rows + self.n)
         await asyncio.to_thread(self._arm, kind)
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
 
@@ -107,17 +113,24 @@ class _Frames(DetectorAcquireLogic):
             self._stop.set()
             if self._task is not None:
                 await asyncio.wait([self._task])
-            await asyncio.to_thread(self._close, failed=bool(self._task and self._task.exception()))
+            error = self._task.exception() if self._task is not None else None
+            await asyncio.to_thread(self._close, error)
             self._task = None
 
-    def _close(self, failed: bool) -> None:
+    def _close(self, error: BaseException | None) -> None:
+        """Shutter, sample and file; the file says how many of the frames that were asked for it lacks, and why."""
         writer, self._writer = self._writer, None
         if writer is not None:
             try:
                 self._devices.shutter.close()
                 self._devices.sample.back()
             finally:
-                writer.close("failed" if failed else "complete")
+                status, reason = "complete", ""
+                if error is not None or self._lacking:
+                    status = "failed" if error is not None else "stopped"
+                    why = f": {error}" if error is not None else ", as the plan ended before"
+                    reason = f"{writer.rows} of {self._lacking.stop} frames were taken{why}."
+                writer.close(status, self._lacking, reason=reason)
 
     def _arm(self, kind: FrameKind) -> None:
         devices = self._devices
@@ -154,6 +167,7 @@ class _Frames(DetectorAcquireLogic):
                 writer.append(frame, digest(frame.counts, 2**camera.timing.bits - 1, self._config.storage.preview_bin))
                 loop.call_soon_threadsafe(self._set_rows, writer.committed)
         finally:
+            self._lacking = range(writer.rows, self._lacking.stop)
             camera.disarm()
 
     def _next(self, by_software: bool) -> Any:

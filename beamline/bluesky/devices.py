@@ -88,19 +88,21 @@ class TomoScan(Device):
         if self._folder is None:
             return
         try:
-            asked = ask(self._folder, verb)
-            while asked.state() is None:  # an end of the plan need not wait for it
+            asked = await asyncio.to_thread(ask, self._folder, verb)  # a disk that hangs must not hold the RunEngine
+            while await asyncio.to_thread(asked.state) is None:  # an end of the plan need not wait for it
                 await asyncio.sleep(POLL)
         except ConfigError:
-            if self._task is not None and not self._task.done() and not state_of(self._folder).ended:
-                raise
+            if self._task is not None and not self._task.done():
+                state = await asyncio.to_thread(state_of, self._folder)
+                if not state.ended:
+                    raise
 
     @AsyncStatus.wrap
     async def kickoff(self) -> None:
         """Start the scan. Raises what it raises before its file is there; nothing has moved then."""
         self._refuse_second()
         self._stop, self._folder = StopRequest(), None
-        self._stream = ScanStream(self._config, self.name)
+        self._stream = await asyncio.to_thread(ScanStream, self._config, self.name)  # which reads files of angles
         self._task = asyncio.create_task(asyncio.to_thread(self._scan))
         while self._folder is None and not self._task.done():
             await asyncio.sleep(POLL)

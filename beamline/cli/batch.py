@@ -18,14 +18,14 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
     """The files that names and patterns mean, each once, in the order of the names."""
     from beamline.storage.interrupted import scan_file  # here: help needs none of it
 
-    found: dict[Path, None] = {}
+    scans: dict[Path, None] = {}
     for name in value:
         path, root = Path(name), Path(Path(name).anchor)
         matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
         if not matches:
             raise click.BadParameter(f"{name!r} is no file, and no pattern that any file matches")
-        found.update((scan_file(match.resolve()), None) for match in matches)
-    return list(found)
+        scans.update((scan_file(match.resolve()), None) for match in matches)
+    return list(scans)
 
 
 @click.command()

@@ -73,18 +73,18 @@ def acquire(
     clock, taken = SystemClock(), []
     with events_shown(as_json) as sink:
         work = _load(file, shape)
-        found = machine()
-        start = {"machine": found, "folder": folder.absolute(), "rows": work.shape[0], "cols": work.shape[1]}
+        facts = machine()
+        start = {"machine": facts, "folder": folder.absolute(), "rows": work.shape[0], "cols": work.shape[1]}
         sink(BenchStarted(start, time=clock.now()))
         if not as_json:
             frame = f"{work.shape[0]} x {work.shape[1]} pixels, {size(work.frame_bytes)} a frame"
-            click.echo(f"{machine_line(found)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
+            click.echo(f"{machine_line(facts)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
         began = clock.now()
 
         def progress(n: int, of: int, stage: str) -> None:
             per_min = 60 * n / max(clock.now() - began, 1e-9)
-            left = (of - n) * 60 / per_min if n else None
-            sink(TrialReached("bench", n, of, stage, left, per_min, time=clock.now()))
+            seconds_left = (of - n) * 60 / per_min if n else None
+            sink(TrialReached("bench", n, of, stage, seconds_left, per_min, time=clock.now()))
 
         for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)
@@ -160,8 +160,8 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
             if not as_json:
                 click.echo(text)
 
-        found = machine()
-        show(BenchStarted({"machine": found}), machine_line(found) + "\n")
+        facts = machine()
+        show(BenchStarted({"machine": facts}), machine_line(facts) + "\n")
         click.echo("Compiling kernels that are not in the cache.", err=True)
         warm_up()
         for timing in _timings(gaussians, side):

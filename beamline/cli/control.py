@@ -44,9 +44,11 @@ def _only(runs: Path) -> Path:
     """The one run in a folder that goes on."""
     from beamline.scan.control import running
 
-    found = running(runs)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise ConfigError(f"{len(found)} scans run in {runs}: {', '.join(run.name for run in found)}. Name one.")
+    running_scans = running(runs)
+    if len(running_scans) == 1:
+        return running_scans[0]
+    if running_scans:
+        raise ConfigError(
+            f"{len(running_scans)} scans run in {runs}: {', '.join(run.name for run in running_scans)}. Name one."
+        )
     raise ConfigError(f"no scan runs in {runs}. Name the folder of the run. Nothing was changed.")

@@ -46,7 +46,7 @@ def info(
     as_json: bool,
     photons_per_count: float | None,
     dose_in: str | None,
-    **said: Any,
+    **scan_facts: Any,
 ) -> None:
     """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format.
 
@@ -64,14 +64,14 @@ def info(
     if statistics and (truth or masks):
         raise click.UsageError("--statistics is of a scan, --truth and --masks are of a volume: give one of them.")
     if statistics:
-        _print_statistics(SourceOptions(file, **said), output, light, as_json)
+        _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
         return
     if truth or masks:
         _print_measured(file, truth, masks, as_json)
         return
     with json_events(as_json) as sink:
-        facts = dict(describe(SourceOptions(file, **said)))
-        returned = _returned(SourceOptions(file, **said)) if "alignment" in facts.get("kinds", {}) else []
+        facts = dict(describe(SourceOptions(file, **scan_facts)))
+        returned = _returned(SourceOptions(file, **scan_facts)) if "alignment" in facts.get("kinds", {}) else []
         if returned:
             facts["returned"] = [vars(view) for view in returned]
         sink(Done(facts, time=SystemClock().now()))
@@ -116,11 +116,11 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
         with open_scan(scan) as source:
             if light is not None:
                 light.refuse_impossible(source)
-            found = statistics_of(source, counting("statistics", sink, clock))
-            dose = [] if light is None else light_of(source, found, light).said()
-        rows = table(found)
+            statistics = statistics_of(source, counting("statistics", sink, clock))
+            dose = [] if light is None else light_of(source, statistics, light).said()
+        rows = table(statistics)
         if output is not None:
-            write_whole(output, histograms(found))
+            write_whole(output, histograms(statistics))
         facts = {kind: dict(zip(rows[0][1:], said, strict=True)) for kind, *said in rows[1:]}
         sink(Done({**facts, "light": dose, "output": output}, time=clock.now()))
     if as_json:
@@ -166,7 +166,7 @@ def _text(value: Any) -> str:
 @scan_options
 @click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
-def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
+def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
     """Check the scan or volume in FILE against the rules of its format.
 
     Exit code: 0 no error (warnings may be), 5 errors.
@@ -177,7 +177,7 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
     clock = SystemClock()
     with events_shown(as_json) as sink:
         progress = counting("validate", sink, clock)
-        findings, now = findings_of(SourceOptions(file, **said), progress if deep else None), clock.now()
+        findings, now = findings_of(SourceOptions(file, **scan_facts), progress if deep else None), clock.now()
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for finding in findings:
             sink(RuleBroken(**vars(finding), time=now))
@@ -211,13 +211,13 @@ def recover(file: Path, as_json: bool) -> None:
 
     with terminated_like_interrupted(), json_events(as_json) as sink:
         run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
-        found, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
-        for said in left_out:
-            click.echo(f"Warning: {said}", err=True)
-        for done in found:
+        recovered, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
+        for sentence in left_out:
+            click.echo(f"Warning: {sentence}", err=True)
+        for done in recovered:
             sink(Done(done, time=SystemClock().now()))
     if not as_json:
-        click.echo("\n".join(done.said() for done in found))
+        click.echo("\n".join(done.said() for done in recovered))
 
 
 @click.command()
@@ -237,7 +237,7 @@ def ingest(
     sample: str | None,
     no_data: float | None,
     as_json: bool,
-    **said: Any,
+    **scan_facts: Any,
 ) -> None:
     """Copy the scan IN into the new HDF5 scan OUT.h5.
 
@@ -252,7 +252,7 @@ def ingest(
     with events_shown(as_json) as sink:
         refuse_existing(output)
         done = ingest_scan(
-            SourceOptions(source, **said),
+            SourceOptions(source, **scan_facts),
             output,
             pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
             energy_kev=energy_kev,

@@ -34,12 +34,12 @@ class LogLines:
         self._ignored = closed_terminal_ignored if terminal else nullcontext
 
     def __call__(self, event: Event) -> None:
-        said = None if isinstance(event, ReconStarted) else sentence(event)
-        if said is None:
-            said = ", ".join(f"{name} {value}" for name, value in event.data.items())
+        text = None if isinstance(event, ReconStarted) else sentence(event)
+        if text is None:
+            text = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
         with self._lock, self._ignored():
-            self._stream.write(f"{at}  {event.event}: {printable(' '.join(said.split()))}\n")
+            self._stream.write(f"{at}  {event.event}: {printable(' '.join(text.split()))}\n")
             self._stream.flush()
 
 

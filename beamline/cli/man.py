@@ -24,10 +24,10 @@ def man(ctx: click.Context, command: str | None) -> None:
     """
     root = ctx.find_root()
     assert isinstance(root.command, click.Group)
-    found = root.command if command is None else root.command.get_command(root, command)
-    if found is None:
+    page = root.command if command is None else root.command.get_command(root, command)
+    if page is None:
         raise click.UsageError(f"There is no command {command}; `beamline --help` lists them.")
-    own = root if command is None else click.Context(found, info_name=command, parent=root)
+    own = root if command is None else click.Context(page, info_name=command, parent=root)
     codes = dedent((root.command.epilog or "").partition("Exit codes:\n")[2])
     click.echo("\n".join(_page(own, codes)))
 
@@ -35,13 +35,13 @@ def man(ctx: click.Context, command: str | None) -> None:
 def _page(ctx: click.Context, codes: str) -> Iterator[str]:
     """Lines in the language of man(7)."""
     command, name = ctx.command, ctx.command_path.replace(" ", "-")
-    said = cleandoc(command.help or "")
+    description = cleandoc(command.help or "")
     yield f'.TH "{_text(name.upper())}" 1 "" "splatline {_text(version())}"'
     yield ".ad l"
-    yield from (".SH NAME", f"{_text(name)} \\- {_text(' '.join(said.partition(chr(10) * 2)[0].split()))}")
+    yield from (".SH NAME", f"{_text(name)} \\- {_text(' '.join(description.partition(chr(10) * 2)[0].split()))}")
     yield from (".SH SYNOPSIS", f".B {_text(ctx.command_path)}", _text(" ".join(command.collect_usage_pieces(ctx))))
     yield ".SH DESCRIPTION"
-    for paragraph in said.split("\n\n"):
+    for paragraph in description.split("\n\n"):
         yield from _paragraph(paragraph)
     options = (param.get_help_record(ctx) for param in command.get_params(ctx) if isinstance(param, click.Option))
     yield from (".SH OPTIONS", *_list(record for record in options if record is not None))
@@ -61,8 +61,8 @@ def _paragraph(text: str) -> Iterator[str]:
 
 
 def _list(entries: Iterable[tuple[str, str]]) -> Iterator[str]:
-    for name, said in entries:
-        yield from (".TP", f".B {_text(name)}", _text(" ".join(said.split())))
+    for name, text in entries:
+        yield from (".TP", f".B {_text(name)}", _text(" ".join(text.split())))
 
 
 def _text(text: str) -> str:

@@ -44,9 +44,9 @@ def angles_of(text: str) -> NDArray[np.float64]:
         if len(rest) == 2 and rest[1] and 0 < (n := math.ceil((rest[0] - first) / rest[1] - 1e-9)) <= _MOST_VIEWS:
             return np.radians(first + rest[1] * np.arange(n))
     except ValueError:
-        found = np.radians([float(part) for part in text.split(",")]) if ":" not in text else np.empty(0)
-        if found.size and np.isfinite(found).all():
-            return found
+        angles = np.radians([float(part) for part in text.split(",")]) if ":" not in text else np.empty(0)
+        if angles.size and np.isfinite(angles).all():
+            return angles
     else:
         if not rest and math.isfinite(first):
             return np.radians([first])

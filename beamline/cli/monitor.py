@@ -53,7 +53,7 @@ def monitor(
     sheet: Path | None,
     volume: Path | None,
     as_json: bool,
-    **said: Any,
+    **scan_facts: Any,
 ) -> None:
     """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
 
@@ -85,42 +85,47 @@ def monitor(
             read = load(config, overrides)
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
         progress = counting("monitor", sink, clock)
-        found: list[Judged] = []
+        frames: list[Judged] = []
         active: set[tuple[str, Level]] = set()
-        with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
+        with SourceOptions(file, **scan_facts).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
             model = None if volume is None else rendered(volume, source)
             for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
-                found.append(judged)
+                frames.append(judged)
                 if not follow:
-                    progress(len(found), judged.n)
+                    progress(len(frames), judged.n)
                 now = {(flag.check, flag.level) for flag in judged.flags}
                 for flag in judged.flags:
                     if (flag.check, flag.level) not in active:
                         sink(FrameFlagged(flag, time=clock.now()))
                 active = now
-            said_of = verdict(source, found, limits)
+            summed = verdict(source, frames, limits)
             returned = [] if stopped() else returned_views(source)
             ended = [finding.message for finding in scan_ended(source)]
-            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in found]))):
+            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in frames]))):
                 write_whole(sheet, contact_sheet(worst))
-        altered = [said_of.altered] if said_of.altered else []
-        for fault in [*said_of.references, *altered, *ended]:
+        altered = [summed.altered] if summed.altered else []
+        for fault in [*summed.references, *altered, *ended]:
             sink(Warned(fault, time=clock.now()))
-        n, alarmed, again, references = said_of.n_frames, said_of.alarmed, said_of.retaken, said_of.references
+        n, alarmed, again, references = (
+            summed.n_frames,
+            summed.alarmed,
+            summed.retaken,
+            summed.references,
+        )
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
-            "flags": said_of.flags, "references": references,
-            "aside": said_of.aside, "drift": said_of.drift, "returned": [vars(view) for view in returned],
-            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
+            "flags": summed.flags, "references": references,
+            "aside": summed.aside, "drift": summed.drift, "returned": [vars(view) for view in returned],
+            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
         }  # fmt: skip
         sink(Done(done, time=clock.now()))
     if not as_json:
-        end = f"{file}: {n} frames, flagged: {counted(said_of.flags)}"
+        end = f"{file}: {n} frames, flagged: {counted(summed.flags)}"
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""
-        left_out = [f"Not looked at: {'; '.join(said_of.aside)}."] if said_of.aside else []
+        left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
         back = [f"On the way back: {view.said()}." for view in returned]
-        drift = [said_of.drift] if said_of.drift else []
-        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *drift, *left_out, *back, *ended, end]))
+        drift = [summed.drift] if summed.drift else []
+        click.echo("\n".join([*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *ended, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -46,7 +46,7 @@ class Grouped(Repeatable):
     """
 
     def __init__(self, *args: Any, first: Sequence[str], **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **{"context_settings": {"help_option_names": ["-h", "--help"]}, **kwargs})
         self.first = tuple(first)
         self._help_all = click.Option(
             ["--help-all"], is_flag=True, is_eager=True, expose_value=False, callback=_show_all,

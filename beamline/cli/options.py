@@ -6,8 +6,9 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,90 @@ POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
 SEED = click.IntRange(min=0)
 
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+@dataclass(frozen=True)
+class Owner:
+    """The methods that take an option.
+
+    Attributes:
+        setting: those with this setting, by its path in Python, such as `fit.loss`.
+        trait: those with this trait, where the option is no setting.
+        inverted: the option is a flag that switches the setting off.
+    """
+
+    setting: str = ""
+    trait: str = ""
+    inverted: bool = False
+
+
+class Declared(click.Option):
+    """An option that states, once and here, all that commands ask about it.
+
+    Args:
+        owner: the methods that take it; None: it is not a method's.
+        excludes: what does not go with it, by parameter name, and why.
+        needs: another parameter, without which this one means nothing, and the end of the sentence that says so.
+        in_time: it goes with `recon --time`, too.
+        of_one_call: it is of one scan or call, and never part of a recipe.
+        repeated: the command line that repeats a call has it, too.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        owner: Owner | None = None,
+        excludes: Mapping[str, str] | None = None,
+        needs: tuple[str, str] | None = None,
+        in_time: bool = False,
+        of_one_call: bool = False,
+        repeated: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(*args, **kwargs)
+        self.owner, self.excludes, self.needs = owner, dict(excludes or {}), needs
+        self.in_time, self.of_one_call, self.repeated = in_time, of_one_call, repeated
+
+
+def option(*names: str, **facts: Any) -> Decorator:
+    """`click.option` for a `Declared` one."""
+    return click.option(*names, cls=Declared, **facts)
+
+
+def of_views(*names: str, **facts: Any) -> Decorator:
+    """An option that chooses or corrects views, which every method takes."""
+    return option(*names, in_time=True, **facts)
+
+
+def name_of(option: click.Option) -> str:
+    """The long name, without its dashes."""
+    return max(option.opts, key=len).lstrip("-")
+
+
+def declared(command: click.Command) -> dict[str, Declared]:
+    """The options of a command that state what they go with, by parameter name."""
+    return {param.name: param for param in command.params if isinstance(param, Declared) and param.name}
+
+
+def refuse_contradictions(command: click.Command, given: Collection[str], shown: Mapping[str, str]) -> None:
+    """Raises UsageError for two options that do not go together, or one without another that it needs.
+
+    Args:
+        given: names of the parameters that the user gave, and of what else options may exclude.
+        shown: how messages name the latter.
+    """
+    options = declared(command)
+    texts = {name: f"--{name_of(param)}" for name, param in options.items()} | dict(shown)
+    for name in [name for name in options if name in given]:
+        for other, why in options[name].excludes.items():
+            if other in given:
+                raise click.UsageError(f"{texts[name]} does not go with {texts[other]}: {why}. Nothing was computed.")
+        needs = options[name].needs
+        if needs is not None and needs[0] not in given:
+            raise click.UsageError(f"{texts[name]} {needs[1]}")
+
+
 config_argument = click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
 set_option = click.option(
     "--set",
@@ -47,9 +132,10 @@ set_option = click.option(
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
 )
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON event per line to stdout.")
-
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+json_option = option(
+    "--json", "as_json", is_flag=True, in_time=True, of_one_call=True, repeated=False,
+    help="Print one JSON event per line to stdout.",
+)  # fmt: skip
 
 
 def names_in(value: str) -> tuple[str, ...]:

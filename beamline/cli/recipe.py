@@ -15,15 +15,11 @@ import click
 import yaml
 from click.core import ParameterSource
 
+from beamline.cli.options import Declared, name_of
+from beamline.cli.options import option as declared_option
 from beamline.core.files import SETTINGS, require_regular, text_in
 
 _RAW = "beamline.raw"
-_OF_ONE_CALL = (
-    "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
-    "beside", "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
-)  # fmt: skip
-"""Options of a single scan or call, which are not part of a recipe; a preset is in the name of the method."""
-_NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint", "beside")
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
 
 
@@ -37,19 +33,18 @@ class Repeatable(click.Command):
 
 def given(ctx: click.Context) -> dict[click.Option, Any]:
     """The options that the user gave, on the command line or in a recipe, as they were typed there."""
-    found = {}
+    typed = {}
     for param in ctx.command.params:
         source = ctx.get_parameter_source(param.name or "")
         if isinstance(param, click.Option) and source == ParameterSource.COMMANDLINE:
-            found[param] = ctx.meta[_RAW][param.name]
+            typed[param] = ctx.meta[_RAW][param.name]
         elif isinstance(param, click.Option) and source == ParameterSource.DEFAULT_MAP:
-            found[param] = (ctx.default_map or {})[param.name]
-    return found
+            typed[param] = (ctx.default_map or {})[param.name]
+    return typed
 
 
-def name_of(option: click.Option) -> str:
-    """The long name, without its dashes."""
-    return max(option.opts, key=len).lstrip("-")
+def _is_of_one_call(option: click.Option) -> bool:
+    return isinstance(option, Declared) and option.of_one_call
 
 
 def recipe_text(ctx: click.Context, method: str) -> str:
@@ -57,7 +52,7 @@ def recipe_text(ctx: click.Context, method: str) -> str:
     values = {
         name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
-        if option.name not in _OF_ONE_CALL
+        if not _is_of_one_call(option)
     }
     return "".join(f"{name}: {_scalar(value)}\n" for name, value in ({"method": method} | values).items())
 
@@ -86,7 +81,7 @@ def repeating(ctx: click.Context, argument: Path | Sequence[Path], output: Path,
     files = [argument] if isinstance(argument, Path) else argument
     words = ["beamline", str(ctx.info_name), *_leading(ctx), *(str(file.resolve()) for file in files)]
     for option, value in given(ctx).items():
-        if option.name in _NOT_REPEATED or option.name in without:
+        if option.name in ("output", *without) or not getattr(option, "repeated", True):
             continue
         if option.is_flag:
             on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")
@@ -115,8 +110,10 @@ def _from_anywhere(value: str, kind: object) -> str:
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds --config: a recipe, whose options hold where the command line has none."""
-    return click.option(
+    return declared_option(
         "--config",
+        of_one_call=True,
+        repeated=False,
         type=click.Path(path_type=Path),
         is_eager=True,
         expose_value=False,
@@ -132,33 +129,33 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
     options = {
         name_of(option): option
         for option in ctx.command.params
-        if isinstance(option, click.Option) and option.name not in _OF_ONE_CALL
+        if isinstance(option, click.Option) and not _is_of_one_call(option)
     }
-    found: dict[str, Any] = {}
-    for name, said in _read(value).items():
+    defaults: dict[str, Any] = {}
+    for name, text in _read(value).items():
         if name not in options:
             raise click.BadParameter(f"{value}: {name!r} is no option of a recipe; expected {', '.join(options)}")
-        if not isinstance(said, str) or not said:
+        if not isinstance(text, str) or not text:
             raise click.BadParameter(
                 f"{value}: {name} holds no text or several; expected one value, as on the command line"
             )
         option = options[name]
-        found[str(option.name)] = said.split() if option.multiple else said
-    ctx.default_map = found
+        defaults[str(option.name)] = text.split() if option.multiple else text
+    ctx.default_map = defaults
 
 
 def _read(path: Path) -> Mapping[str, Any]:
     """The content of a recipe, all values as text: YAML's own rules would turn 61:04 into 3664."""
     try:
         text = _text(path)
-        said = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
+        content = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(said, dict):
+    if not isinstance(content, dict):
         raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
-    return said
+    return content
 
 
 def _text(path: Path) -> str:

@@ -41,18 +41,18 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
         _serve(folder, port, bind, browse)
         return
     with json_events(as_json) as sink:
-        found = [describe(run) for run in runs_in(folder)]
-        sink(Done({"folder": folder, "runs": found}, time=SystemClock().now()))
+        runs = [describe(run) for run in runs_in(folder)]
+        sink(Done({"folder": folder, "runs": runs}, time=SystemClock().now()))
     if as_json:
         return
-    if not found:
+    if not runs:
         click.echo(f"There is no run in {folder}.", err=True)
         return
-    rows = [HEAD, *map(cells, found)]
+    rows = [HEAD, *map(cells, runs)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    for run in found:
+    for run in runs:
         if run.next_step:
             click.echo(f"{run.folder.name}: {run.next_step}", err=True)
 

@@ -112,8 +112,8 @@ def scan(
             return
         config = series.config if series else config
         assert config is not None
-        for said in series.left_out if series else ():
-            click.echo(f"Warning: {said}", err=True)
+        for sentence in series.left_out if series else ():
+            click.echo(f"Warning: {sentence}", err=True)
         if dry:
             _dry_run(config, output, series, json_sink, as_json)
             return
@@ -203,10 +203,10 @@ def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
     """Join the files of a run that has all its frames, and report it as `beamline recover` does."""
     from beamline.scan.resume import recover_run
 
-    found, left_out = recover_run(run)
+    recovered, left_out = recover_run(run)
     for said in left_out:
         click.echo(f"Warning: {said}", err=True)
-    for done in found:
+    for done in recovered:
         json_sink(Done(done, time=SystemClock().now()))
         if not as_json:
             click.echo(done.said())
@@ -216,17 +216,17 @@ def _faults(result: RunResult) -> list[str]:
     """The faults of the frames of a complete scan, and their consequences."""
     from beamline.storage.flag_legend import counted
 
-    said = []
+    words = []
     if result.alarmed_frames:
         verb = "has" if result.alarmed_frames == 1 else "have"
         again = f", beside {count(result.retaken, 'view')} that were taken again" if result.retaken else ""
-        said.append(
+        words.append(
             f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{again}: "
             f"{counted(result.flags)}."
         )
     if result.alarmed_views and (treated := _treated(result.path)):
-        said.append(f"A reconstruction (--flags use): {treated} Repeat the scan where too many views are lost.")
-    return [*said, *result.reference_faults]
+        words.append(f"A reconstruction (--flags use): {treated} Repeat the scan where too many views are lost.")
+    return [*words, *result.reference_faults]
 
 
 def _treated(path: Path) -> str:

@@ -98,19 +98,19 @@ def segment(
         **values,
     )
     with terminated_like_interrupted(), json_events(as_json) as sink:
-        found = segment_volume(options)
+        labels = segment_volume(options)
         files = {"output": output, "table": options.table, "picture": options.picture}
-        sink(Done({**files, **settings_of(found, options)}, time=SystemClock().now()))
+        sink(Done({**files, **settings_of(labels, options)}, time=SystemClock().now()))
     if not as_json:
-        click.echo(summary(found, options))
+        click.echo(summary(labels, options))
     if view:
-        show(found)
+        show(labels)
 
 
-def summary(found: Segmented, options: SegmentOptions) -> str:
+def summary(result: Segmented, options: SegmentOptions) -> str:
     """The result for people."""
-    figures, unit = found.particles.statistics(), found.unit
-    _, rows, cols = found.box
+    figures, unit = result.particles.statistics(), result.unit
+    _, rows, cols = result.box
     crop = "none, the whole volume"
     if options.margin is not None:
         crop = (
@@ -121,25 +121,27 @@ def summary(found: Segmented, options: SegmentOptions) -> str:
         f"{'labels':<12}{options.output}",
         f"{'table':<12}{options.table}",
         f"{'picture':<12}{options.picture}",
-        f"{'box':<12}{' x '.join(map(str, found.labels.shape))} voxels of {found.volume.grid.voxel_size:g} {unit}",
+        f"{'box':<12}{' x '.join(map(str, result.labels.shape))} voxels of {result.volume.grid.voxel_size:g} {unit}",
         f"{'crop':<12}{crop}",
-        f"{'clusters':<12}{found.clusters.centres.size}, threshold {found.clusters.threshold:.3f} of the range",
+        f"{'clusters':<12}{result.clusters.centres.size}, threshold {result.clusters.threshold:.3f} of the range",
         f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
     ]
-    if found.outside:
-        one = found.outside == 1
-        said = f"{'1 body' if one else f'{found.outside} bodies'} as bright outside the square {'is' if one else 'are'}"
-        lines.append(f"{'left out':<12}{said} no particle here; --crop none takes the whole volume, with its wall")
+    if result.outside:
+        one = result.outside == 1
+        bodies = (
+            f"{'1 body' if one else f'{result.outside} bodies'} as bright outside the square {'is' if one else 'are'}"
+        )
+        lines.append(f"{'left out':<12}{bodies} no particle here; --crop none takes the whole volume, with its wall")
     if "d50" in figures:
         sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
         lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")
     return "\n".join(lines)
 
 
-def show(found: Segmented) -> None:
+def show(result: Segmented) -> None:
     """Open volume and labels in napari, until its window is closed."""
     napari = import_module("napari")
-    viewer, spacing = napari.Viewer(), found.volume.grid.spacing
-    viewer.add_image(found.volume.data, scale=spacing, name="volume")
-    viewer.add_labels(found.labels, scale=spacing, name="particles")
+    viewer, spacing = napari.Viewer(), result.volume.grid.spacing
+    viewer.add_image(result.volume.data, scale=spacing, name="volume")
+    viewer.add_labels(result.labels, scale=spacing, name="particles")
     napari.run()

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
-from beamline.cli.options import POSITIVE, parsed, together
+from beamline.cli.options import POSITIVE, of_views, parsed, together
 from beamline.cli.scan_options import scan_options
-from beamline.projections.steps.registry import key_of, registered, steps_of
-from beamline.projections.steps.step import Option, PrepStep, options_of
+from beamline.projections.protocols import PrepStep
+from beamline.projections.registry import registered, steps_of
+from beamline.projections.step import Option, options_of
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -69,33 +71,32 @@ def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return together(*_BEFORE, scan_options, *_AFTER, *map(_of_step, _step_options()))(command)
 
 
-def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
-    """The scan and the part of it that the options in `said` name."""
+def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
+    """The scan, and the part of it that the values of a command's parameters name."""
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
 
-    if said["axis"] is not None and not isinstance(said["axis"], float):
+    if values["axis"] is not None and not isinstance(values["axis"], float):
         raise click.UsageError("--axis try is for beamline recon.")
-    steps, keys = steps_said(said), {key_of(option.name) for option in _step_options()}
-    rest = {name: value for name, value in said.items() if name not in keys}
-    pixel_size_um = rest.pop("pixel_size_um")
+    pixel_size_um = values["pixel_size_um"]
     selection = Selection(
-        views=rest.pop("views"),
-        rows=rest.pop("rows"),
-        binning=rest.pop("binning"),
-        axis_col=rest.pop("axis"),
+        views=values["views"],
+        rows=values["rows"],
+        binning=values["binning"],
+        axis_col=values["axis"],
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
-        cone=rest.pop("cone"),
+        cone=values["cone"],
         seed=seed,
-        steps=steps,
+        steps=chosen_steps(values),
     )
-    return SourceOptions(file, **rest), selection
+    facts = {field.name: values[field.name] for field in fields(SourceOptions) if field.name in values}
+    return SourceOptions(file, **facts), selection
 
 
-def steps_said(said: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """The steps for the options in `said`."""
+def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
+    """The steps for the options in `values`."""
     try:
-        return steps_of(said)
+        return steps_of(values)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
 
@@ -107,7 +108,7 @@ def _step_options() -> list[Option]:
 
 def _of_step(option: Option) -> Callable[..., Any]:
     """An option of a step as an option of the command line."""
-    return click.option(
+    return of_views(
         option.name,
         type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if option.path else str,
         callback=parsed(lambda value: option.parse(str(value))),
@@ -120,26 +121,26 @@ def _of_step(option: Option) -> Callable[..., Any]:
 
 _BEFORE = (
     heading(DATA),
-    click.option(
+    of_views(
         "--views",
         default="all",
         show_default=True,
         metavar="SPEC",
         help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N | every:K",
     ),
-    click.option(
+    of_views(
         "--rows",
         callback=parsed(span),
         metavar="FIRST:END",
         help="Detector rows to use; the volume has one slice per row. Default: all.",
     ),
-    click.option(
+    of_views(
         "--cols",
         callback=parsed(span),
         metavar="FIRST:END",
         help="Detector columns to use, as if there were no others: --axis and messages count from FIRST. Default: all.",
     ),
-    click.option(
+    of_views(
         "--bin",
         "binning",
         type=click.IntRange(min=1),
@@ -147,7 +148,7 @@ _BEFORE = (
         show_default=True,
         help="Average blocks of N x N pixels.",
     ),
-    click.option(
+    of_views(
         "--axis",
         callback=parsed(column),
         metavar="PX|auto|try:A:B:STEP",
@@ -159,12 +160,12 @@ _BEFORE = (
 )
 _AFTER = (
     heading(DATA),
-    click.option(
+    of_views(
         "--pixel-size-um",
         type=POSITIVE,
         help="Pixel size at the sample (cone beam: on the detector). Default: as in the file.",
     ),
-    click.option(
+    of_views(
         "--cone",
         callback=parsed(distances),
         metavar="SOD:SDD",

@@ -238,6 +238,6 @@ def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) 
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
     output("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
-    found = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
-    output("labels", f"{written.labels}  {found or 'no anomaly'}")
+    events = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
+    output("labels", f"{written.labels}  {events or 'no anomaly'}")
     return written

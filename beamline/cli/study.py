@@ -16,7 +16,7 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.files import REPORT
-from beamline.study.studies import STUDIES
+from beamline.trials.view_choices import STUDIES
 from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names
@@ -97,15 +97,15 @@ def study(
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.study.run import StudyOptions, run_study
-    from beamline.study.table import text
-    from beamline.tradeoff.opened import ComparedScan
+    from beamline.trials.layout import text
+    from beamline.trials.runner import ComparedScan
+    from beamline.trials.study import StudyLayout, StudyOptions, run_study
 
     methods = tuple(dict.fromkeys(methods))
     lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
     if lengths:
         raise click.UsageError(f"--{lengths[0]} and --seconds exclude each other. Give one of them.")
-    settings = row_settings(methods, values)
+    settings = row_settings(click.get_current_context().command, methods, values)
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_{which}")
     options = StudyOptions(
@@ -122,8 +122,8 @@ def study(
     with events_shown(as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not as_json:
-        click.echo(text(table))
+        click.echo(text(table, StudyLayout(STUDIES[which])))
         click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
-        rows = sum(cell.row.groups is not None for cell in table.cells)
-        raise ScanStopped(f"The study was stopped after {len(table.done)} of {rows} rows; {folder} holds those.")
+        counts = f"{table.n_done} of {len(table.todo)}"
+        raise ScanStopped(f"The study was stopped after {counts} rows; {folder} holds those.")

@@ -49,19 +49,19 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
         count = counting("slices", sink, clock)
         try:
             if source == "volume":
-                found = surface_of_volume(volume, dataset, level, count)
+                extracted = surface_of_volume(volume, dataset, level, count)
             elif dataset is not None:
                 raise click.UsageError("--dataset does not go with --from gaussians.")
             else:
-                found = surface_of_gaussians(volume, level, count)
+                extracted = surface_of_gaussians(volume, level, count)
         except ValueError as error:
             raise DataError(f"{volume}: {error}. Nothing was written.") from error
-        write_mesh(output, found.mesh, found.unit)
-        mesh, unit = found.mesh, found.unit
+        write_mesh(output, extracted.mesh, extracted.unit)
+        mesh, unit = extracted.mesh, extracted.unit
         facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "euler": mesh.euler}
-        sink(Done({"output": output, "level": found.level, **facts, "volume": mesh.volume, "unit": unit},
+        sink(Done({"output": output, "level": extracted.level, **facts, "volume": mesh.volume, "unit": unit},
                   time=clock.now()))  # fmt: skip
     if not as_json:
-        click.echo(f"output   {output}\nlevel    {found.level:.5g} {found.level_unit}".rstrip())
+        click.echo(f"output   {output}\nlevel    {extracted.level:.5g} {extracted.level_unit}".rstrip())
         click.echo(f"mesh     {facts['vertices']} vertices, {facts['triangles']} triangles, Euler number {mesh.euler}")
         click.echo(f"matter   {mesh.volume:.6g} {unit}³ inside")

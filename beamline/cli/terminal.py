@@ -215,14 +215,14 @@ def fit(at: FitReached) -> str:
 
 def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]:
     """A listener that reports the progress of a stage of the work, a few times a second."""
-    began, said = clock.now(), -math.inf
+    began, last_line_at = clock.now(), -math.inf
 
     def progress(n: int, total: int) -> None:
-        nonlocal said
+        nonlocal last_line_at
         now = clock.now()
-        if now - said < SAY_EVERY and n < total:
+        if now - last_line_at < SAY_EVERY and n < total:
             return
-        said = now
+        last_line_at = now
         rate = n / max(now - began, 1e-9)
         sink(Counted(stage, n, total, rate, (total - n) / rate, time=now))
 
@@ -253,5 +253,5 @@ def results(record: ReconRecord) -> str:
 
 
 def _clock_time(seconds: float) -> str:
-    left = round(seconds)
-    return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
+    whole_seconds = round(seconds)
+    return f"{whole_seconds // 3600}:{whole_seconds // 60 % 60:02}:{whole_seconds % 60:02}"

@@ -123,10 +123,10 @@ def tradeoff(
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
     from beamline.scan.energies import scans_of
-    from beamline.tradeoff.compared import Several
-    from beamline.tradeoff.opened import ComparedScan
-    from beamline.tradeoff.report import text
-    from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
+    from beamline.trials.front import TRADEOFF
+    from beamline.trials.layout import text
+    from beamline.trials.runner import ComparedScan
+    from beamline.trials.tradeoff import Several, TradeoffOptions, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
     if seconds is not None and (volumes is not None or spectra is not None):
@@ -148,7 +148,7 @@ def tradeoff(
         )
         table = run_tradeoff(options, sink, SystemClock(), begun=begun)
     if not as_json:
-        click.echo(text(table))
+        click.echo(text(table, TRADEOFF))
         click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"

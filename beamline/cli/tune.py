@@ -48,11 +48,11 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     """
     from beamline.scan.tune import tune as tune_exposure
 
-    found = evaluated(file, overrides, as_json, tune_exposure, angle)
-    if found.faults:
-        if math.isnan(found.advised):
+    result = evaluated(file, overrides, as_json, tune_exposure, angle)
+    if result.faults:
+        if math.isnan(result.advised):
             raise QualityError("These references would stop a scan, and no exposure mends that: look at the FAULT.")
-        raise QualityError(f"These references would stop a scan; {found.advised:.4g} s is the exposure to take.")
+        raise QualityError(f"These references would stop a scan; {result.advised:.4g} s is the exposure to take.")
 
 
 def evaluated(
@@ -73,12 +73,12 @@ def evaluated(
             connect(config, ask=lambda request: terminal.ask(request, ask_operator)) as instrument,
             Announcer([terminal, json_sink], instrument.clock) as emit,
         ):
-            found = evaluate(config, instrument, stop, emit, None if angle is None else math.radians(angle))
+            result = evaluate(config, instrument, stop, emit, None if angle is None else math.radians(angle))
             now = instrument.clock.now()
-        json_sink(Done(found, time=now))
+        json_sink(Done(result, time=now))
     if not as_json:
-        click.echo("\n".join(found.lines()))
-    return found
+        click.echo("\n".join(result.lines()))
+    return result
 
 
 @click.command()

@@ -54,10 +54,10 @@ def view(
         serve_shown(server, browse)
 
 
-def _named(said: str) -> tuple[Path, str | None]:
+def _named(text: str) -> tuple[Path, str | None]:
     """FILE::NAME as the file and the array in it; a file that has such a name itself comes first. Of the folder of a
     run, its volume."""
     from beamline.storage.interrupted import volume_file
 
-    path, separator, name = said.rpartition("::")
-    return (Path(path), name) if separator and not Path(said).exists() else (volume_file(Path(said)), None)
+    path, separator, name = text.rpartition("::")
+    return (Path(path), name) if separator and not Path(text).exists() else (volume_file(Path(text)), None)

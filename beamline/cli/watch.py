@@ -58,8 +58,8 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     folder = path or Path(RUNS)
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
-    if not held(what.scan) and (said := next_step(what.scan)):
-        click.echo(said, err=True)
+    if not held(what.scan) and (advice := next_step(what.scan)):
+        click.echo(advice, err=True)
     reader = Reader(what)
     try:
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)

@@ -49,12 +49,12 @@ def boxes(values: Sequence[str]) -> tuple[PixelBox, ...]:
 def charges_of(value: str) -> tuple[float, ...]:
     """Numbers from 0 to 1 apart by commas, each once. ValueError for anything else."""
     try:
-        found = tuple(float(part) for part in value.split(","))
+        numbers = tuple(float(part) for part in value.split(","))
     except ValueError:
-        found = ()
-    if not found or len(set(found)) < len(found) or not all(0 <= charge <= 1 for charge in found):
+        numbers = ()
+    if not numbers or len(set(numbers)) < len(numbers) or not all(0 <= charge <= 1 for charge in numbers):
         raise ValueError(f"{value!r} are no states of charge; expected numbers from 0 to 1, e.g. 0,0.5,1")
-    return found
+    return numbers
 
 
 @click.command()
@@ -178,15 +178,15 @@ def xafs(
                     break
         if len(jobs) == 1:
             write(results[0], target)
-            said, data = lines(results[0]), results[0].data()
+            shown_lines, data = lines(results[0]), results[0].data()
         else:
             write_both(states.picture(results), states.table(results), target)
-            said, data = states.lines(results), states.data(results)
+            shown_lines, data = states.lines(results), states.data(results)
         stopped = run.stopped or len(results) < len(jobs)
         data |= {"picture": target, "table": table_beside(target), "stopped": stopped}
         json_sink(Done(data, time=clock.now()))
     if not as_json:
-        click.echo("\n".join([*said, f"written     {target}, {table_beside(target)}"]))
+        click.echo("\n".join([*shown_lines, f"written     {target}, {table_beside(target)}"]))
     if stopped:
         n = sum(result.curve.energies.size + result.curve.left_out.size for result in results)
         raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
@@ -221,16 +221,16 @@ def _charge_map(
         for path in (volume, target):
             refuse_existing(path)
         table = None if spectra is None else read_spectra(spectra)
-        found = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
-        drawn = picture(found)
+        charge = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
+        drawn = picture(charge)
         with ExitStack() as undo:
-            write_volume(volume, found.record)
+            write_volume(volume, charge.record)
             undo.callback(remove, volume)
             write_whole(target, drawn)
             undo.pop_all()
-        sink(Done({"volume": volume, "picture": target, **found.data()}, time=clock.now()))
+        sink(Done({"volume": volume, "picture": target, **charge.data()}, time=clock.now()))
     if not as_json:
-        click.echo("\n".join([*found.lines(), f"written     {volume}, {target}"]))
+        click.echo("\n".join([*charge.lines(), f"written     {volume}, {target}"]))
 
 
 def _result(title: str, run: SeriesResult) -> XafsResult:

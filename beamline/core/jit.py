@@ -6,6 +6,8 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+import recon  # noqa: F401 - it says what processor numba compiles for
+
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """As `numba.njit(**options)`; the function is compiled, or read from numba's cache, when it is first used."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 def degrees(angle: float) -> str:
@@ -53,3 +53,9 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
             groups.append((i, i))
     text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in groups[:limit])
     return text if len(groups) <= limit else f"{text}, ... ({len(indices)} in all)"
+
+
+def frames_text(frames: Iterable[int]) -> str:
+    """Frames of a file as `frame 3` or `frames 3, 7`."""
+    numbers = [str(int(frame)) for frame in frames]
+    return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(numbers)

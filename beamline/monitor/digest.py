@@ -2,8 +2,8 @@
 
 Counts (uint16) are read once, line by line: each line is in the processor's cache while its range, sums and histogram
 are taken. Their sums are integers, so that mean and variance are exact. Other types need the range before the
-histogram, so they are read twice. Pixels that are not finite, or hold the no-data value, are counted and otherwise
-ignored: they never spread into a mean or into a neighbour's preview block.
+histogram, so they are read twice. Pixels that are not finite, hold the no-data value, or lie beyond what any detector
+counts (LARGEST), are counted and otherwise ignored: they never spread into a mean or into a neighbour's preview block.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from beamline.core.jit import njit
 
 ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
+LARGEST = 1e15  # of a pixel, either sign: float32 holds the squares of such numbers, and sums of them over a frame
 SMALL, LARGE = 4, 8  # pixels a side of the blocks that the checks see; large ones where ENOUGH of them remain
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
 
@@ -32,7 +33,7 @@ class FrameDigest:
         minimum, maximum, mean: in the frame's own unit (counts for a raw frame).
         variance: population variance (divisor n), unit squared.
         sum_abs: sum of absolute values.
-        invalid_fraction: pixels that are not finite or hold the no-data value, over all pixels.
+        invalid_fraction: pixels that are not finite, beyond LARGEST or hold the no-data value, over all pixels.
         saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
             (0 for a constant frame, at most 8). For counts, of every k-th row where there are more than 2**20 pixels.
@@ -299,7 +300,7 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):
             for row in range(first, last):
                 for col in range(left, right):
                     value = image[row, col]
-                    if np.isfinite(value) and value != no_data:
+                    if abs(value) <= LARGEST and value != no_data:
                         n_block += 1
                         sum_block += value
                         sum_abs += abs(value)
@@ -316,7 +317,7 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):
             for row in range(first, last):
                 for col in range(left, right):
                     value = image[row, col]
-                    if np.isfinite(value) and value != no_data:
+                    if abs(value) <= LARGEST and value != no_data:
                         squares += (value - mean_block) ** 2
             step = mean_block - mean
             squares += step * step * n * n_block / (n + n_block)
@@ -333,6 +334,6 @@ def _count_reals(image, low, high, no_data):
     for row in range(image.shape[0]):
         for col in range(image.shape[1]):
             value = image[row, col]
-            if np.isfinite(value) and value != no_data:
+            if abs(value) <= LARGEST and value != no_data:
                 histogram[min(int((value - low) * scale), ENTROPY_BINS - 1)] += 1
     return histogram

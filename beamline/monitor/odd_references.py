@@ -22,6 +22,7 @@ from beamline.monitor.references import (
     ReferenceFault,
     ReferenceFrame,
     ReferenceLimits,
+    is_blank,
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import MEDIAN
@@ -42,7 +43,8 @@ def without_odd(
         views: some projections, by which a flat with the sample in the beam is known; they need `cells`.
     """
     limits = limits or ReferenceLimits()
-    darks, flats = ([list(g) for g in groups if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    blank, numbers = ([list(g) for g in groups if is_blank(g) is is_so] for is_so in (True, False))
+    darks, flats = ([g for g in numbers if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
     judged: list[JudgedGroup] = []
     darks = _split(darks, _unusable(darks, None, limits), judged)
     darks = _split(darks, _lit_darks(darks, flats), judged)
@@ -52,7 +54,7 @@ def without_odd(
     if views:
         flats = _split(flats, with_sample(flats, darks, views, single=True), judged)
         flats = _split(flats, with_sample(flats, darks, views, single=False), judged)
-    return [*darks, *flats], judged
+    return [*darks, *flats, *blank], judged
 
 
 def _split(
@@ -109,7 +111,7 @@ def _lit_darks(darks: list[list[ReferenceFrame]], flats: list[list[ReferenceFram
         same = [frame for group in darks for frame in group if _exposure(frame) == exposure]
         base = min(same, key=_level)
         lowest = _level(base)
-        levels = [_level(frame) for group in flats for frame in group]
+        levels = [_level(frame) for group in flats for frame in group if not is_blank([frame])]
         light = (max(levels) if levels else max(map(_level, same))) - lowest
         limit = max(LIT * light, BLOCK_SIGMAS * noise_of(base.blocks))
         for frame in same:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
-from beamline.monitor.digest import FrameDigest
+from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT
 from drivers.base.frame import Frame, FrameKind
 
@@ -42,7 +42,7 @@ class PixelsState:
 class PixelsCheck:
     """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
     of the light around them. It is said at the first view, as a fact where they are few. In a view also the fraction
-    that holds no number (NaN, infinite) but does in the darks and flats.
+    that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where none does.
 
     The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
     """
@@ -59,6 +59,8 @@ class PixelsCheck:
 
     def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
         holes = digest.invalid_fraction
+        if holes == 1:  # no mask, whatever the frame shows
+            return Look(state, self._without_number(frame.index, holes))
         if frame.kind is not FrameKind.PROJECTION:
             state = replace(state, holes=max(state.holes, holes))
         elif holes - state.holes > HOLES:
@@ -77,8 +79,9 @@ class PixelsCheck:
 
     def _without_number(self, row: int, score: float) -> Flag:
         advice = (
-            f"{score:.2%} of the pixels hold no number (NaN or infinite) that do in the darks and flats: the camera's "
-            "link, or the program that wrote them. `beamline recon` fills pixels, and leaves out a view without any."
+            f"{score:.2%} of the pixels hold no number (NaN, infinite or beyond {LARGEST:g}), more than in darks and "
+            "flats: the camera's link, or the program that wrote them. `beamline recon` fills pixels, and leaves out a "
+            "view without any."
         )
         return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from beamline.core.text import spans
-from beamline.monitor.digest import FrameDigest, thinned
+from beamline.monitor.digest import LARGEST, FrameDigest, thinned
 from drivers.base.frame import FrameKind
 from recon.base.arrays import median_deviation
 
@@ -155,13 +155,17 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
         views: some projections, if there are any.
     """
     limits = limits or ReferenceLimits()
-    base = min((group for group in groups if group[0].kind is FrameKind.DARK), key=_level, default=None)
-    flats = [group for group in groups if group[0].kind is FrameKind.FLAT]
+    numbers = [group for group in groups if not is_blank(group)]
+    views = [view for view in views if not is_blank([view])]
+    base = min((group for group in numbers if group[0].kind is FrameKind.DARK), key=_level, default=None)
+    flats = [group for group in numbers if group[0].kind is FrameKind.FLAT]
     known = [group for group in flats if _saturated(group, base, limits) is None] or flats
     bright = max(known, key=lambda group: _light(group, base), default=None)
     found = []
     for group in groups:
-        if group[0].kind is FrameKind.DARK:
+        if is_blank(group):
+            faults: list[ReferenceFault | None] = [_BLANK]
+        elif group[0].kind is FrameKind.DARK:
             faults = [] if bright is None else [_lit(group, bright, base or group, limits)]
         else:
             faults = [_saturated(group, base, limits), _without_beam(group, base, bright or group, limits)]
@@ -172,6 +176,16 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
         rows = tuple(reference.row for reference in group)
         found.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
     return tuple(found)
+
+
+def is_blank(group: Group) -> bool:
+    """No pixel of its frames holds a number."""
+    return all(np.isnan(reference.blocks).all() for reference in group)
+
+
+_BLANK = ReferenceFault(
+    FaultKind.NOT_FINITE, 1.0, 0.0, f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
+)
 
 
 def photons(flats: Group, darks: Group) -> float | None:

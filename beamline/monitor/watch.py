@@ -17,9 +17,10 @@ from beamline.monitor.change import MOST_STEPS, SPAN, change_of
 from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
+from beamline.monitor.pixels import PixelsCheck
 from beamline.monitor.scatter import running_mean
 from beamline.monitor.shake import Shake
-from beamline.monitor.spots import spots_of
+from beamline.monitor.spots import NO_SPOTS, spots_of
 from beamline.monitor.view import CellView, dimmer_than_flats, grid_of, light_left, view_of
 from drivers.base.frame import Frame, FrameKind
 
@@ -69,7 +70,7 @@ class Monitor:
 def usual_step(angles: NDArray[np.float64]) -> float:
     """Median step from one of these angles, in the order of their views, to the next. NaN where they do not turn one
     way (golden or random angles): no view then has its neighbour beside it."""
-    steps = np.diff(angles)
+    steps = np.diff(np.where(np.isfinite(angles), angles, np.nan))
     steps = steps[np.isfinite(steps) & (steps != 0)]
     share = float((steps > 0).mean()) if steps.size else 0.5
     return float(np.median(steps)) if max(share, 1 - share) > ONE_WAY else math.nan
@@ -106,9 +107,16 @@ def look(
         CheckError: a check raised, whatever it was, or returned what is no `Look`. The monitor that came in is as it
             was: go on `without` that check.
     """
-    monitor = _with_view(monitor, frame, digest)
+    if blank := digest.invalid_fraction == 1:  # only the check of pixels has something to say
+        monitor = replace(monitor, context=replace(monitor.context, view=None, change=None, spots=NO_SPOTS))
+    else:
+        digest = _without_holes(digest)
+        monitor = _with_view(monitor, frame, digest)
     looks: list[Look[Any]] = []
     for check, state in zip(monitor.checks, monitor.states, strict=True):
+        if blank and not isinstance(check, PixelsCheck):
+            looks.append(Look(state))
+            continue
         begin(check.name)
         try:
             looks.append(_valid(check.look(state, frame, digest, monitor.context), check.name, frame.index))
@@ -116,9 +124,19 @@ def look(
             if isinstance(error, KeyboardInterrupt) and threading.current_thread() is threading.main_thread():
                 raise  # Ctrl-C
             raise CheckError(check.name) from error
-    after = replace(_with_reference(monitor, frame, digest), before=digest, states=tuple(look.state for look in looks))
+    after = monitor if blank else replace(_with_reference(monitor, frame, digest), before=digest)
+    after = replace(after, states=tuple(look.state for look in looks))
     unbroken = frame.index - after.counted + 1
     return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)
+
+
+def _without_holes(digest: FrameDigest) -> FrameDigest:
+    """The digest with the frame's median in blocks without a valid pixel."""
+    holes = np.isnan(digest.preview)
+    if not holes.any():
+        return digest
+    preview, peaks = (np.where(holes, np.nanmedian(each), each) for each in (digest.preview, digest.peaks))
+    return replace(digest, preview=preview, peaks=peaks)
 
 
 def _valid(answer: Any, name: str, at: int) -> Look[Any]:

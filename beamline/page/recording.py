@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ class Recording:
     """A scan file of ours, opened for reading while it may still be written.
 
     Args:
-        alone: it may draw on no file outside of its folder, since another user may have written it.
+        alone: it may be no link and draw on no file outside of its folder, since another user may have written it.
 
     Raises:
         NotReadyError: the file is just being made.
@@ -43,7 +43,8 @@ class Recording:
 
     def __init__(self, path: Path, alone: bool = False) -> None:
         self.path = path
-        self._file = hdf5.open_hdf5(path, follow=True)
+        with hdf5.opened_itself(path) if alone else nullcontext():
+            self._file = hdf5.open_hdf5(path, follow=True)
         try:
             if alone:
                 require_inside(self._file)
@@ -77,7 +78,7 @@ class Recording:
         n, times = int(committed[()]), self._file[layout.TIME]
         if n:
             hdf5.look_again(times)
-        newest = float(times[n - 1]) if n else None
+        newest = _json_number(times[n - 1]) if n else None
         return ScanProgress(n, hdf5.text_of(status) if finished[()] else "running", newest)
 
     def facts(self) -> dict[str, Any]:
@@ -90,7 +91,7 @@ class Recording:
             "shape": self.shape,
             "preview_bin": self.preview_bin,
             "pixel_mm": pixel,
-            "axis_col": None if axis is None else float(axis[()]),
+            "axis_col": None if axis is None else _json_number(axis[()]),
             "checks": [
                 {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(self._file)
             ],
@@ -118,7 +119,7 @@ class Recording:
                         "frame": int(frame),
                         "check": check.name,
                         "alarm": bool(bits >> check.alarm_bit & 1),
-                        "score": score if np.isfinite(score) else None,
+                        "score": _json_number(score),
                         "region": None if region[0] < 0 else region,
                     }
                 )
@@ -170,18 +171,19 @@ class Recording:
             bin_of_source * factor,
         )
 
-    def trace(self, region: TileRegion, first: int) -> list[float]:
+    def trace(self, region: TileRegion, first: int) -> list[float | None]:
         """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""
         blocks = TileRegion(*(edge // self.preview_bin for edge in astuple(region)))
         rows, cols = blocks.inside((self._preview.shape[1], self._preview.shape[2])).slices
         hdf5.look_again(self._preview)
-        return [float(self._preview[frame, rows, cols].mean()) for frame in range(first, self.progress().frames)]
+        frames = range(first, self.progress().frames)
+        return [_json_number(self._preview[frame, rows, cols].mean()) for frame in frames]
 
     def _column(self, path: str, first: int, frames: int) -> list[Any]:
         column = self._file[path]
         hdf5.look_again(column)
         values = column[first:frames]
-        return [None if value != value else value.item() for value in values]  # NaN has no place in JSON
+        return [_json_number(value) for value in values] if values.dtype.kind == "f" else values.tolist()
 
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Means of the first darks and flats, at most eight each; None until there are some of both."""
@@ -198,3 +200,8 @@ class Recording:
         for row in rows:
             total += self._data[int(row)]
         return total / np.float32(rows.size)
+
+
+def _json_number(value: Any) -> float | None:
+    """The number; None for NaN and infinity, which have no place in JSON."""
+    return float(value) if np.isfinite(value) else None

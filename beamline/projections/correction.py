@@ -13,14 +13,14 @@ from scipy import ndimage
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.flags import Flags, gap_said
+from beamline.projections.corrections.references import current_scale, use_current
 from beamline.projections.filters import ViewFilters
-from beamline.projections.flags import gap_said
 from beamline.projections.open_beam import OpenBeam, count_references
-from beamline.projections.read import current_scale, read_binned, reading_memory, tell_damaged, use_current
+from beamline.projections.read import read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.rules.validate import altered_said
@@ -55,7 +55,7 @@ class ScanCorrection:
         self._filters = ViewFilters.of(source, selection)
         self.rows, self.binning = self._filters.rows, selection.binning
         if self._filters.filters:
-            selection = selection.having(CountModel("log"))
+            selection = selection.with_steps(CountModel("log"))
         self._source, self._selection, self._warn = source, selection, warn
         if source.altered:
             warn(altered_said(source))

@@ -6,10 +6,11 @@ import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.projections.flags import checked_views
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.refusals import checked_views
+from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import EmissionOf, ScanSource
 from recon.prep.correct import Projections
 from recon.voxels.emission import Emission, weighted_lines
@@ -52,6 +53,6 @@ def prepare_emission(
         n_projections=source.image_key.size,
         length_unit="px" if pixel_size(source, selection) is None else "mm",
         quantity="emission",
-        done={step.name: StepDone(parameters={}) for step in selection.in_order},
+        done={step.name: StepDone(parameters={}) for step in in_order(selection)},
         emission=emission,
     )

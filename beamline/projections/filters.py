@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.protocols import ViewFilter, ViewStep
+from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, rows_of
-from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.step import StepDone, ViewFilter, ViewStep
+from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from recon.prep.correct import Projections
 
@@ -40,7 +42,7 @@ class ViewFilters:
             ConfigError: rows or binning that do not fit the detector, or filters of counted photons.
         """
         rows = rows_of(source, selection)
-        found = {step.name: step.on(source, selection) for step in selection.in_order if isinstance(step, ViewStep)}
+        found = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in found.values() if each is not None)
         if filters and selection.step(CountModel).noise == "counts":
             raise ConfigError(

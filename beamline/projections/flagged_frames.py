@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from itertools import zip_longest
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.check import Level
-from beamline.report.contact_sheet import FlaggedFrame
 from beamline.storage.flag_legend import FlagBit, FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import groups_of
 from drivers.base.frame import FrameKind
 from recon.base.binning import bin_views
+
+if TYPE_CHECKING:
+    from beamline.report.contact_sheet import FlaggedFrame
 
 MOST = 12
 APART = 3  # frames of a kind that are shown are at least so far apart: neighbours look alike
@@ -85,6 +88,8 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
 
 
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
+    from beamline.report.contact_sheet import FlaggedFrame  # here, as it loads matplotlib
+
     angle = float(np.degrees(source.angles[row]))
     kind, replaces = FrameKind(int(source.image_key[row])).name.lower(), source.replaces
     if replaces is not None and (new := np.flatnonzero(replaces == row)).size:

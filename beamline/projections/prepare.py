@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +13,25 @@ from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import ScanPoses, poses_of, require_known, stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.emission import prepare_emission
-from beamline.projections.flags import UsableViews, checked_views
-from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
-from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
+from beamline.projections.protocols import ScanStep
+from beamline.projections.refusals import checked_views
+from beamline.projections.registry import in_order
+from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
+from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.truncation import cut_said, cut_sides
+from beamline.projections.usable_views import UsableViews
+from beamline.projections.view_geometry import ViewGeometry
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
+from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -40,7 +42,7 @@ _HELD_OUT_VIEWS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Spill:
+class DiskBuffer:
     """Line integrals on disk instead of in memory, for work in slabs.
 
     Attributes:
@@ -58,7 +60,7 @@ def prepare_projections(
     source: ScanSource,
     selection: Selection,
     warn: Warn,
-    spill: Spill | None = None,
+    buffer: DiskBuffer | None = None,
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
@@ -68,8 +70,8 @@ def prepare_projections(
         source: a finished scan.
         selection: what to use.
         warn: is told, in a sentence, of everything that is not as it should be though work goes on.
-        spill: where line integrals lie. Rays that were not measured, or weigh nothing by the flags, are filled there as
-            a direct method does it, and `shares` is None.
+        buffer: on disk, takes the line integrals; None: they stay in memory. Rays that were not measured, or weigh
+            nothing by the flags, are interpolated there, and `shares` is None.
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
         phases: is told what is done, one after the other.
@@ -79,129 +81,109 @@ def prepare_projections(
         ConfigError: the selection does not fit the scan.
     """
     if (emission := source.emission) is not None:
-        if spill is not None:
+        if buffer is not None:
             raise DataError(
                 f"{source.path}: counts of an emission have to be in memory. Give more --memory, or --rows."
             )
         return prepare_emission(source, emission, selection, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable = checked_views(source, selection, warn)
-    pixel_size(source, selection)
-    first = choose_views(source, usable.frames, selection)  # what is wrong is told before any frame is read
-    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
-    poses = poses_of(source, selection, usable.frames)
-    if poses is not None:
-        require_known(poses, source, selection, usable.frames[first])
+    usable, poses = _usable(source, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
-    if poses is None:
-        warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
+    if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
+        warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     _warn_of_other_axis(source, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
-    places = _Places(source, selection, axis_col)
-    usable = places.find(usable, warn, phases)
-    chosen = choose_views(source, usable.frames, selection, places.of(usable.frames).period)
-    wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
-    if poses is not None:
-        require_known(poses, source, selection, wanted)
-        rest = rest[poses.known(rest)]
-    others_ids = spread(rest, _HELD_OUT_VIEWS)
-    places.calibrate(np.union1d(wanted, others_ids), phases)
+    view_geometry = ViewGeometry(source, selection, axis_col)
+    usable = view_geometry.find_motion(usable, warn, phases)
+    used, others = _chosen(view_geometry, usable, poses)
+    view_geometry.calibrate(np.union1d(used, others), phases)
     if check is not None:
-        check(places.of(wanted))
+        check(view_geometry.of(used))
     phases.enter("correction")
-    if spill is None:
-        projections = correction.at_once(wanted, progress=phases.progress)
+    projections = _corrected(source, correction, used, buffer, phases)
+    phases.enter("background, rings, views held out, hardening", "corrections")
+    held_out = None
+    with suppress(NoViewError):  # those held out may all be without light
+        held_out = correction.at_once(others) if others.size else None
+    geometry, on_disk = view_geometry.of(projections.view_ids), buffer is not None
+    at = view_geometry.axis_col, axis
+    prepared = assemble(source, selection, projections, geometry, at, usable, warn, on_disk)
+    if held_out is not None:
+        prepared = replace(
+            prepared,
+            held_out=(held_out.data, view_geometry.of(held_out.view_ids)),
+            held_out_ids=held_out.view_ids,
+            held_out_weights=held_out.weights,
+        )
+    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
+    done = {**correction.done, **tilt, **view_geometry.done}
+    prepared = _after_scan_steps(source, selection, replace(prepared, done=done), phases)
+    if on_disk:
+        _fill_unknown(prepared)
+    return prepared
+
+
+def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
+    """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
+    usable = checked_views(source, selection, warn)
+    pixel_size(source, selection)
+    first = choose_views(source, usable.frames, selection)
+    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
+    poses = poses_of(source, selection, usable.frames)
+    if poses is not None:
+        require_known(poses, source, selection, usable.frames[first])
+    return usable, poses
+
+
+def _chosen(
+    view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the file of the views that are used, and of some others that are held out."""
+    source, selection, frames = view_geometry.source, view_geometry.selection, usable.frames
+    chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
+    used, rest = frames[chosen], np.delete(frames, chosen)
+    if poses is not None:
+        require_known(poses, source, selection, used)
+        rest = rest[poses.known(rest)]
+    return used, spread(rest, _HELD_OUT_VIEWS)
+
+
+def _corrected(
+    source: ScanSource,
+    correction: ScanCorrection,
+    used: NDArray[np.int64],
+    buffer: DiskBuffer | None,
+    phases: Phases,
+) -> Projections:
+    """Line integrals of these rows of the file. DataError where fewer than half of them can be used."""
+    if buffer is None:
+        projections = correction.at_once(used, progress=phases.progress)
     else:
-        projections = correction.in_batches(wanted, spill.views, spill.batch, spill.progress)
-    if 2 * projections.view_ids.size < wanted.size:
+        projections = correction.in_batches(used, buffer.views, buffer.batch, buffer.progress)
+    if 2 * projections.view_ids.size < used.size:
         raise DataError(
-            f"{source.path}: only {projections.view_ids.size} of {wanted.size} views can be used; the others have no "
+            f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
             "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
             "those that can be used with --views, or repeat the others."
         )
-    phases.enter("background, rings, views held out, hardening", "corrections")
-    others = None
-    with suppress(NoViewError):  # those held out may all be without light
-        others = correction.at_once(others_ids) if rest.size else None
-    ids = projections.view_ids
-    on_disk, column = spill is not None, places.axis_col
-    found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)
-    if others is not None:
-        found = replace(
-            found,
-            held_out=(others.data, places.of(others.view_ids)),
-            held_out_ids=others.view_ids,
-            held_out_weights=others.weights,
-        )
-    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
-    done = {**correction.done, **tilt, **places.done}
-    found = replace(found, done=done)
-    steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
+    return projections
+
+
+def _after_scan_steps(
+    source: ScanSource, selection: Selection, prepared: PreparedProjections, phases: Phases
+) -> PreparedProjections:
+    """The views after the steps on all of them, which change line integrals in place."""
+    done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
+    prepared = replace(prepared, done=done)  # a step sees what those before it did
     for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(found, source.angles[ids], phases.progress)
+        done[step.name] = step.apply(prepared, source.angles[prepared.projections.view_ids], phases.progress)
         phases.progress(n, len(steps))
-    if on_disk:
-        _fill_unknown(found)
-    return found
-
-
-@dataclass(eq=False)
-class _Places:
-    """Where the views see the sample from: the stated angles, and what steps find out and change."""
-
-    source: ScanSource
-    selection: Selection
-    stated_axis: float
-    moved: dict[str, ViewPlaces] = field(default_factory=dict)
-    rays: dict[str, StepDone] = field(default_factory=dict)
-    learnt: Calibrated | None = None
-
-    @property
-    def axis_col(self) -> float:
-        """The column of the rotation axis."""
-        return self.stated_axis if self.learnt is None else self.stated_axis + self.learnt.axis
-
-    @property
-    def done(self) -> dict[str, StepDone]:
-        """What the steps did, by their names."""
-        calibrated = {} if self.learnt is None else {self.selection.step(Calibrate).name: self.learnt.done}
-        return {**{name: places.done for name, places in self.moved.items()}, **self.rays, **calibrated}
-
-    def find(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
-        """Let each step find the places of the views; those of `usable` that still can be used."""
-        for step in (step for step in self.selection.in_order if isinstance(step, PlaceStep)):
-            found = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
-            self.moved[step.name] = found
-            if found.said:
-                warn(found.said)
-            usable = usable.only(found.frames)
-        return usable
-
-    def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
-        """Learn the geometry from these views, where that is asked for."""
-        step = self.selection.step(Calibrate)
-        if step.geometry:
-            phases.enter("calibration", "steps")
-            self.learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
-
-    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views, before calibration."""
-        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
-        for found in self.moved.values():
-            geometry = found.corrected(geometry, view_ids)
-        for step in (step for step in self.selection.in_order if isinstance(step, RayStep)):
-            geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
-        return geometry
-
-    def of(self, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views."""
-        geometry = self.uncalibrated(self.selection, view_ids)
-        return geometry if self.learnt is None else self.learnt.corrected(geometry, view_ids)
+    return prepared
 
 
 def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:

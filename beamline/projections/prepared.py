@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.voxel_kind import VoxelKind
-from beamline.projections.steps.step import StepDone
+from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.steps.width import TO_MIDDLE
+from beamline.projections.corrections.width import TO_MIDDLE
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry

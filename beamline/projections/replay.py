@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -19,6 +20,7 @@ from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
+from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
 from beamline.storage.writer_lock import WriterWatch
@@ -252,9 +254,11 @@ def _saturation(source: ScanSource) -> float:
 
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on; their exposure is 1 s where it is not known, so that those of views and flats agree."""
+    """Frames from `first` on, with NaN for an angle that is none. Their exposure is 1 s where it is not known, so that
+    those of views and flats agree."""
     for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
-        yield frame if frame.exposure > 0 else replace(frame, exposure=1.0)
+        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
+        yield replace(frame, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
 
 
 def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:

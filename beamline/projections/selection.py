@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.registry import all_steps
-from beamline.projections.steps.step import PrepStep
-from beamline.storage.readers.base import ScanSource
+from beamline.projections.step import NamedStep
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 
-S = TypeVar("S", bound=PrepStep)
+if TYPE_CHECKING:
+    from beamline.storage.readers.base import ScanSource
+
+S = TypeVar("S", bound=NamedStep)
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 
@@ -34,7 +35,7 @@ class Selection:
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         seed: of random view selections.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
-        steps: corrections that are to do something else than their defaults, see `beamline.projections.steps`.
+        steps: corrections that are to do something else than their defaults, see `beamline.projections.corrections`.
     """
 
     views: str = "all"
@@ -45,21 +46,16 @@ class Selection:
     cone: tuple[float, float] | None = None
     seed: int = 0
     axis_rows: tuple[int, int] | None = None
-    steps: tuple[PrepStep, ...] = ()
+    steps: tuple[NamedStep, ...] = ()
 
     def step(self, kind: type[S]) -> S:
         """The step of a kind: the one given, else one that does what its defaults say."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
-    def having(self, *steps: PrepStep) -> Selection:
+    def with_steps(self, *steps: NamedStep) -> Selection:
         """The same with these steps, each in place of another one of its kind."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
-
-    @property
-    def in_order(self) -> list[PrepStep]:
-        """Every step that there is, each after those that it follows."""
-        return [self.step(kind) for kind in all_steps()]
 
 
 def choose_views(
@@ -135,6 +131,18 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
         selection.binning
     )
+
+
+def pivot_of(source: ScanSource, selection: Selection) -> float:
+    """The middle row of the detector, binned and counted from the first row used."""
+    middle, binning = (source.shape[0] - 1) / 2, selection.binning
+    return (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
+
+
+def with_pivot(geometry: Geometry, pivot: float) -> Geometry:
+    """The geometry whose views roll and tilt about the row `pivot`."""
+    # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
+    return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)
 
 
 def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from beamline.core.errors import DataError
 from beamline.core.text import count, size
-from beamline.projections.poses import stated_geometry
+from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted

@@ -21,16 +21,18 @@ from beamline.core.errors import DataError
 from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
-from beamline.core.text import count
+from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.flags import UsableViews, checked_views, correction_blockers, refuse, usable_views
-from beamline.projections.jumps import frames_text
+from beamline.projections.corrections.flags import Flags, usable_views
+from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PlaceStep, RayStep, ScanStep
+from beamline.projections.refusals import checked_views, correction_blockers, refuse
+from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis, geometry_of
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.jumps import Jumps
-from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone
+from beamline.projections.step import StepDone
+from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
@@ -263,7 +265,7 @@ class ScanFollower:
         """The geometry of views with the motion of the stage in their exposures, and what its steps did."""
         selection, done = self._options.selection, dict[str, StepDone]()
         geometry = geometry_of(self.source, selection, axis_col, self.source.angles[view_ids])
-        for step in selection.in_order:
+        for step in in_order(selection):
             if isinstance(step, RayStep):
                 geometry, done[step.name] = step.rays(self.source, selection, geometry)
         return geometry, done
@@ -431,7 +433,7 @@ class ScanFollower:
         axis = axis_col, self._axis.estimate
         found = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}
-        for step in selection.in_order:
+        for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):

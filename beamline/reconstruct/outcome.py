@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,15 @@ from beamline.projections.flagged_frames import reasons, reference_images, worst
 from beamline.projections.returned import returned_views
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
-from beamline.report.contact_sheet import FlaggedFrame
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.validate import scan_ended
 from drivers.base.frame import FrameKind
 from recon.methods import by_name
 from recon.voxels.fbp import Filter
+
+if TYPE_CHECKING:
+    from beamline.report.contact_sheet import FlaggedFrame
 
 
 @dataclass(frozen=True)

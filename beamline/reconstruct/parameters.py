@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.steps.registry import recorded
+from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.outcome import ReportContext
 from beamline.reconstruct.remarks import partly_seen
 from beamline.storage.writers.recon_file import Value
@@ -40,7 +40,7 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
-        **(done := recorded(selection.in_order, prepared.done)),
+        **(done := recorded(in_order(selection), prepared.done)),
         **({"view_shifts_px": geometry.shifts} if "jumps" in done or geometry.shifts.any() else {}),
         **({"slices_partly_seen": few} if (few := partly_seen(geometry)).size else {}),
         **({"view_roll_deg": np.degrees(geometry.roll)} if geometry.roll.any() else {}),

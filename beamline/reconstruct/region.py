@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.poses import stated_poses
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

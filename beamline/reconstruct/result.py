@@ -15,8 +15,6 @@ from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
-from beamline.reconstruct.recon_report import compose
-from beamline.report.html import write_report
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage.recon_record import ReconRecord, VolumeInFile
 from beamline.storage.volumes.files import opened_volume, write_volume
@@ -56,6 +54,9 @@ def write_result(
     page: Path | None = None
     try:
         if target.report is not None:
+            from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
+            from beamline.report.html import write_report
+
             metrics, parameters = judged.metrics, record.parameters
             report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")

@@ -15,13 +15,15 @@ from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import ScanPart
+from beamline.projections.registry import in_order
 from beamline.projections.selection import choose_views, cone_of, rows_of
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.poses import stated_poses
-from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import ScanPart, StepMemory
+from beamline.projections.step import StepMemory
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -182,7 +184,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     pixel = pixel if source.emission is None else _EMISSION
     needs = Needs.of(options.method, views, shape, pixel, axis)
     part = ScanPart(source, selection, needs.geometry)
-    stated = {step.name: step.memory(part) for step in selection.in_order}
+    stated = {step.name: step.memory(part) for step in in_order(selection)}
     return replace(
         needs,
         method=options.method_for(needs.geometry),
@@ -192,9 +194,9 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     )
 
 
-def spill_of(
+def disk_buffer_of(
     source: ScanSource, options: ReconOptions, progress: Callable[[int, int], None], warn: Callable[[str], None]
-) -> Spill | None:
+) -> DiskBuffer | None:
     """Where the views go if they do not fit into the memory; None if they fit, or if slabs are impossible.
 
     Raises:
@@ -222,7 +224,7 @@ def spill_of(
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
     )
     shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
-    return Spill(scratch_array(options.target.output.parent, shape), batch, progress)
+    return DiskBuffer(scratch_array(options.target.output.parent, shape), batch, progress)
 
 
 def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
@@ -294,20 +296,20 @@ def prepare_within(
         sink(StateEntered("memory", text, time=clock.now()))
 
     memory = memory_of(options)
-    spill = spill_of(source, options, progress, say)
+    buffer = disk_buffer_of(source, options, progress, say)
 
     def check(geometry: Geometry) -> None:
         if options.region is not None:
             locate(options.region, options.selection, geometry)
-        if spill is not None and not geometry.is_straight:
+        if buffer is not None and not geometry.is_straight:
             raise DataError(
                 f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
                 "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
             )
 
-    prepared = prepare_projections(source, options.selection, warn, spill, check, phases)
+    prepared = prepare_projections(source, options.selection, warn, buffer, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
-    if spill is None:
+    if buffer is None:
         if options.partial is not None:
             raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
         needs = Needs(method, geometry, 0, not method.traits.direct, bars=options.uncertainty)

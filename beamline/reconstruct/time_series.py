@@ -17,8 +17,8 @@ from beamline.core.phases import Phases
 from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import Warnings
 from beamline.core.text import size
-from beamline.projections.poses import stated_geometry
 from beamline.projections.prepare import prepare_projections
+from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.offline import require_finished
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of

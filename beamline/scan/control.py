@@ -19,7 +19,7 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, Warned, event_in, whole_lines
-from beamline.core.files import EVENTS, open_below, parts_of
+from beamline.core.files import EVENTS, open_below, parts_of, same_file
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
@@ -56,7 +56,7 @@ class _Requests:
             return ""
         try:
             ours = os.fstat(self._held)
-            same = os.path.samestat(os.lstat(self._folder), ours)
+            same = same_file(os.lstat(self._folder), ours)
         except OSError:
             same = False
         return _not_private(ours) if same else "it is gone, or another was put in its place"

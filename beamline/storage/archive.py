@@ -100,9 +100,7 @@ def archive(
         except OSError as error:
             raise DataError(f"{out} could not be written ({hdf5.reason(error)}). Nothing is left of it.") from error
         _drop_from_cache(partial)
-        with hdf5.open_hdf5(partial) as file:
-            differs = next(_differences(raw, file, copy.checksums, count_image), "")
-        if differs:
+        if differs := _differs(raw, partial, copy.checksums, count_image):
             raise DataError(
                 f"{out} does not give back what was written: {differs} differs. The disk, or the memory, is faulty. "
                 f"Nothing is left of it, and {scan} is untouched."
@@ -110,7 +108,7 @@ def archive(
         parts = (scan.parent / name for dataset in datasets for name in _drawn_from(dataset))
         sources = tuple(dict.fromkeys((scan, *parts)))
         raw_bytes, compared = sum(path.stat().st_size for path in sources), partial.stat()
-    if out.is_symlink() or not os.path.samestat(out.stat(), compared):
+    if out.is_symlink() or not _is_compared(out, compared, scan, copy.checksums):
         raise DataError(f"{out} is not the file that was written and compared. Keep {scan}, which is untouched.")
     return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)), altered)
 
@@ -152,6 +150,20 @@ def _drop_from_cache(path: Path) -> None:
     if hasattr(os, "posix_fadvise"):
         with path.open("rb") as file:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def _is_compared(out: Path, compared: os.stat_result, scan: Path, checksums: Mapping[str, list[int]]) -> bool:
+    """Whether this is the file that was compared. Where a file system numbers it anew, it is compared again."""
+    if os.path.samestat(out.stat(), compared):
+        return True
+    with hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):
+        return not _differs(raw, out, checksums, lambda image: None)
+
+
+def _differs(raw: h5py.File, path: Path, checksums: Mapping[str, list[int]], count_image: CountImage) -> str:
+    """The first difference of the raw file and its copy at this path; "" without one."""
+    with hdf5.open_hdf5(path) as file:
+        return next(_differences(raw, file, checksums, count_image), "")
 
 
 def _differences(

@@ -7,6 +7,7 @@ import errno
 import math
 import os
 import re
+import stat
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
@@ -19,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, damaged, memory_limit_said, out_of_memory
+from beamline.core.files import leads_away, same_file
 from beamline.core.text import printable
-from beamline.storage.disk_file import DiskFile, GrowingFile
+from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
 from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
@@ -122,14 +124,46 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
 def grows_here(path: Path) -> bool:
     """Whether this program has the file open by HDF5's own driver, to write it or to follow it."""
     here = path.stat()
-    for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
+    for file in _open_by_name().values():
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            alone = file.get_access_plist().get_driver() == h5py.h5fd.fileobj_driver
-            if alone or file.get_intent() == h5py.h5f.ACC_RDONLY:
-                continue
-            if os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
+            if file.get_intent() != h5py.h5f.ACC_RDONLY and same_file(here, Path(os.fsdecode(file.name)).stat()):
                 return True
     return False
+
+
+def _open_by_name() -> dict[int, Any]:
+    """The files of this program that HDF5 has opened itself, by their names, and its numbers of them."""
+    files = {}
+    for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
+        with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
+            if file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver:
+                files[file.id] = file
+    return files
+
+
+@contextmanager
+def opened_itself(path: Path) -> Iterator[None]:
+    """What the block opens by this name is the regular file of the name, and not what a link led to meanwhile.
+
+    For files in another user's folder, as HDF5 opens by name. On Windows, where its handles cannot be looked at, a link
+    that still stands there is found.
+
+    Raises:
+        DataError: it is something else.
+    """
+    by_name, others = {*_open_by_name()}, {*UnderHdf5.opened}
+    yield
+    try:
+        here = os.lstat(path)
+        opened = [file.stat() for file in {*UnderHdf5.opened} - others if file.path == path]
+        for number, file in _open_by_name().items() if os.name == "posix" else ():
+            if number not in by_name and os.fsdecode(file.name) == str(path):
+                opened.append(os.fstat(file.get_vfd_handle()))
+        itself = stat.S_ISREG(here.st_mode) and not leads_away(path) and all(same_file(here, each) for each in opened)
+    except (OSError, ValueError):  # it is gone, or was closed
+        itself = False
+    if not itself:
+        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself to have it read.")
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:

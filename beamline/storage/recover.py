@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
@@ -231,7 +231,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
                 f"{path} cannot be mended in place: its frames are copied to a new file of about {size(head.size)}; "
                 f"the damaged file is kept as {kept.name}."
             )
-            if kept.exists() and kept.samefile(path):
+            if kept.exists() and same_file(kept.stat(), path.stat()):
                 kept.unlink()  # a recovery died between its last two steps
             refuse_existing(kept)
             with whole_file(new, replace=True) as partial, hdf5.created(partial, layout.LIBVER) as made:
@@ -264,15 +264,21 @@ def _rows_readable(file: h5py.File) -> int:
     """Number of rows from the first on whose columns and pixels can be read, up to the last that is as written."""
     n = int(file[layout.COMMITTED][()])
     for path in layout.GROWING:
-        n = min(n, len(file[path]))
-        while n and not _reads(file[path], slice(n)):
-            n -= 1
-    for row in range(n):
-        if not all(row < len(file[path]) and _reads(file[path], row) for path in (layout.DATA, layout.PREVIEW)):
-            n = row
-            break
+        n = _most_rows(file[path], n)
+    images = file[layout.DATA], file[layout.PREVIEW]
+    n = min(n, *map(len, images))
+    n = next((row for row in range(n) if not all(_reads(item, row) for item in images)), n)
     good = np.setdiff1d(np.arange(n), altered_rows(file, 0, n))
     return int(good[-1]) + 1 if good.size else 0
+
+
+def _most_rows(column: h5py.Dataset, most: int) -> int:
+    """Number of rows from the first on that can be read, `most` at most: those of a readable part can be, too."""
+    least, most = 0, min(most, len(column))
+    while least < most:
+        half = (least + most + 1) // 2
+        least, most = (half, most) if _reads(column, slice(half)) else (least, half - 1)
+    return least
 
 
 def _reads(item: h5py.Dataset, rows: slice | int) -> bool:

@@ -20,7 +20,7 @@ KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 
 DEFAULT_STEPS = 400  # Steps of a fit before a finish on voxels
 
-SHORT_STEPS = 200  # Steps if the noise of the views hides the gain of more steps
+MODEL_STEPS = 50  # Steps of a fit whose volume voxels make, as they predict as well: its Gaussians are a rough model
 
 NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
 

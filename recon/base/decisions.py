@@ -30,3 +30,9 @@ class Decisions:
         made.append(before[len(made)] if len(made) < len(before) else decide())
         value: T = made[-1]
         return value
+
+    def preset(self, made: Mapping[str, Sequence[Any]]) -> None:
+        """Take these as the next decisions of their names, unless a followed run has made them."""
+        for name, values in made.items():
+            if len(self._followed.get(name, ())) <= len(self.made.get(name, ())):
+                self._followed = {**self._followed, name: [*self.made.get(name, ()), *values]}

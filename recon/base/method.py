@@ -247,6 +247,14 @@ class TimedMethod(Method, Protocol):
 
 
 @runtime_checkable
+class ChoosingMethod(Method, Protocol):
+    """A method that may take the volume of another one, where that predicts views held out as well."""
+
+    def as_candidate(self) -> Self:
+        """The method that makes its own volume."""
+
+
+@runtime_checkable
 class BoundedMethod(Method, Protocol):
     """A method with a setting for the time of its whole run."""
 

@@ -1,4 +1,4 @@
-"""parse_views: a selection of views from its short form, such as all, fixed:90, sector:30-150:60 or every:4."""
+"""Selections of views: by a short form such as all, fixed:90, sector:30-150:60 or every:4, and evenly spread ones."""
 
 from __future__ import annotations
 
@@ -93,3 +93,27 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: 
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
     distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # the earliest view at each angle
     return np.sort(views[distinct[np.arange(n) * distinct.size // n]])
+
+
+def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """At most `n` of the frames, evenly spread; of a full turn half as many, and with each the one opposite to it.
+
+    Args:
+        angles: [frame], radians.
+        frames: [frame], their rows in the file.
+    """
+    every = np.arange(angles.size)
+    if angles.size <= n:
+        return frames
+    if np.ptp(angles) < 1.5 * np.pi:
+        return frames[spread(every, n)]
+    some = spread(every, n // 2)
+    away = np.abs(np.mod(angles[some][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
+    return frames[np.union1d(some, away.argmax(axis=1))]
+
+
+def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """At most `n` of the items [item], evenly spread, with the first and the last."""
+    if items.size <= n:
+        return items
+    return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]

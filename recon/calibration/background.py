@@ -28,7 +28,7 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.vectors import dot
 from recon.prep.background import LEAST_SIZE, coordinate, powers
 from recon.splatting.initialise import leaves_the_field
-from recon.voxels.held_out_weight import beyond_chance, split_views
+from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector, projection_lines, volume_lines

@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.prep.rings import steadiness
-from recon.voxels.held_out_weight import beyond_chance, busiest_rows, split_views
+from recon.voxels.held_out import beyond_chance, busiest_rows, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector

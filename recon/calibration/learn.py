@@ -22,7 +22,7 @@ from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.calibration.freedom import TERMS, GeometryChange, edge_motion
 from recon.calibration.joint import JointFit, taller
-from recon.voxels.held_out_weight import beyond_chance
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 

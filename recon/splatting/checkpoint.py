@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from recon.splatting.settings import NAMES
 
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
+_DECIDED = "decided."  # names of arrays of decisions begin so
 _WORDS = 4  # 64-bit words: state and increment of PCG64
 
 
@@ -87,3 +88,17 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
         parts["parameters"], parts["first"], parts["second"], device.array(arrays["statistic"]), unit, rng, limit,
         kernel=kernel, step=step, drawn=arrays["drawn"].tolist(), seen=seen, loss=loss, residual=residual,
     )  # fmt: skip
+
+
+def decisions_of(made: Mapping[str, Sequence[Any]], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The first decisions of these names, numbers or lists of numbers, as arrays of a checkpoint."""
+    return {_DECIDED + name: np.array(made[name][0], np.float64) for name in names if made.get(name)}
+
+
+def decisions_from(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
+    """The inverse of `decisions_of`."""
+    decided = {name.removeprefix(_DECIDED): each for name, each in arrays.items() if name.startswith(_DECIDED)}
+    for name, values in decided.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} of the checkpoint is {values.tolist()}, expected finite numbers")
+    return {name: [values.tolist()] for name, values in decided.items()}

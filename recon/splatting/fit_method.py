@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 from recon.base.choices import Start
 from recon.base.geometry import Geometry
@@ -43,6 +43,16 @@ class FitMethod(Method, Protocol):
     @property
     def planned_steps(self) -> int | None:
         """Number of steps of the fit; None if only `seconds` end it."""
+
+    @property
+    def by_content(self) -> bool:
+        """Views held out tell whether the fit pays, see `finish.best_candidate`."""
+
+    def as_candidate(self) -> Self:
+        """The method whose fit is made, whatever voxels predict."""
+
+    def fit_alone(self, gaussians: int | None) -> Self:
+        """The candidate from so many Gaussians, without a finish; None: as many as it takes by default."""
 
     @property
     def least_steps(self) -> int | None:

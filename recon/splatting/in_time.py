@@ -15,7 +15,8 @@ from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
+from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.tv import TotalVariationProx, difference_weights
@@ -80,9 +81,9 @@ class FinishPlan(NamedTuple):
     """What a finish may take.
 
     Attributes:
-        sweeps: None: as many as views held out prefer.
+        sweeps: of total variation; None: as many as it makes by default, and steps with sparse patches.
         seconds: that it will take.
-        trials: views held out choose its weight; else it is the one by the noise.
+        trials: views held out choose its prior; else it is total variation by the noise.
     """
 
     sweeps: int | None
@@ -91,7 +92,7 @@ class FinishPlan(NamedTuple):
 
 
 def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
-    """A fit's finish within `seconds`: at most `SWEEPS`, unless `beside_steps` suffice for the most and their trials.
+    """A fit's finish within `seconds`: at most `SWEEPS`, unless `beside_steps` suffice for patches and their trials.
 
     Where time is short it goes without trials of its weight, which on few rows cost more than seven finishes. A time
     for fewer than two sweeps gives 0, because the work before them takes as long.
@@ -99,11 +100,10 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     if seconds <= 0:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
-    if geometry.is_cone:
-        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps run twice
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
-    choice, asking = choice_sweeps(geometry) * sweep, sweeps_choice_cost(geometry)
-    if asking and (most := before + choice + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
+    choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
+    most = before + (SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+    if choice and most <= min(seconds, beside_steps):
         return FinishPlan(None, most)
     trials = before + choice + SWEEPS * sweep <= seconds
     before += choice if trials else 0.0

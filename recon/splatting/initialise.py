@@ -147,18 +147,6 @@ def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bo
     return bool(np.median(edges[away > _FARTHEST * away.max()]) > _EMPTY * inside)
 
 
-def goes_on_beyond(projections: NDArray[np.float32], geometry: Geometry) -> bool:
-    """Whether the rays of a cone cross matter above or below the field: the first or last rows are not empty.
-
-    Rays of a parallel beam stay in their slice.
-    """
-    if not geometry.is_cone:
-        return False
-    height = max(1, geometry.detector_shape[0] // 50)
-    edges = projections[:, :height].mean(axis=(1, 2)), projections[:, -height:].mean(axis=(1, 2))
-    return max(map(np.median, edges)) > _EMPTY * float(np.median(projections.mean(axis=(1, 2))))
-
-
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
     """Projections [view, row, col] with values above ten times the largest of other views filled from neighbours.
 

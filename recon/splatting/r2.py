@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.assess.plans import PRESETS, best_steps
 from recon.base.arrays import F32
-from recon.base.choices import Quality
+from recon.base.choices import DEFAULT_STEPS, MODEL_STEPS, Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
@@ -21,10 +21,10 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.schedule import DEFAULT_STEPS, ENDED_AT, SHORT_STEPS
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
@@ -35,9 +35,9 @@ class R2:
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit. 0 gives the starting point. None takes 400. Where a finish
-            follows, it takes 200 if the noise of the views hides the gain of more (see `schedule.Schedule`). It takes
-            100 if a trial shows no gain of more. With `seconds` it takes as many as fit.
+        steps: of the fit. 0 gives the starting point. None takes 400, or 50 where views held out say that voxels alone
+            predict as well: then they make the volume, see `finish.best_candidate`. With `seconds` it takes as many as
+            fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
             are too few for the start, a warning says so before it, and the start uses binned views.
@@ -45,8 +45,9 @@ class R2:
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
         with the lowest residual.
-        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8
-            to 24 as views held out prefer. The result's `gaussians` stay the model as it was fitted.
+        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8,
+            and steps with sparse patches as views held out prefer. The result's `gaussians` stay the model as it was
+            fitted.
         allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
     """
@@ -90,10 +91,22 @@ class R2:
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
     @property
+    def by_content(self) -> bool:
+        """Views held out tell whether the fit pays."""
+        given = self.steps is not None or self.seconds is not None or self.finish is not None
+        return not (given or self.early_stop or isinstance(self.gaussians, Gaussians))
+
+    @property
     def least_steps(self) -> int | None:
-        if self.steps is not None or self.seconds is not None or self.finish_sweeps == 0:
-            return self.planned_steps
-        return ENDED_AT if self.finish is None and not self.early_stop else SHORT_STEPS
+        return MODEL_STEPS if self.by_content else self.planned_steps
+
+    def as_candidate(self) -> Self:
+        """The fit that competes with methods on voxels: it is made, whatever they predict."""
+        return replace(self, steps=self.planned_steps) if self.by_content else self
+
+    def fit_alone(self, gaussians: int | None) -> Self:
+        """The candidate from so many Gaussians, without a finish."""
+        return replace(self.as_candidate(), gaussians=gaussians, finish=0)
 
     @property
     def finish_sweeps(self) -> int:
@@ -154,4 +167,5 @@ class R2:
         count = given or default_count(geometry, grid.voxel_size)
         grown = growth(self.fit) / DensityPolicy.growth
         of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
-        return of_gaussians + iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)
+        refined = iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)
+        return max(of_gaussians + refined, PnpDct().memory(geometry, grid, weighted))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
+from recon.base.choices import MODEL_STEPS
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -23,8 +24,8 @@ from recon.base.ray_width import NO_WIDTH
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
-from recon.splatting.checkpoint import arrays_of, state_from
-from recon.splatting.finish import FinishTrial, finish, try_finish
+from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
+from recon.splatting.finish import best_candidate, finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
@@ -45,10 +46,15 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
-from recon.splatting.schedule import TRIAL_AT, Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.splatting.splat import voxelize
+from recon.voxels.iterative import UNITS
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.projector import data_residual
+
+_ON_VOXELS = FistaTv, PnpDct  # candidates that a fit is compared with, the simpler one first
+_DECIDED = "candidate", UNITS, "weight", "strength"  # decisions that a checkpoint keeps
 
 _TIMED = 3  # steps after which a fit's seconds are planned
 _LOOK = 50  # steps between two measurements of the views held out
@@ -96,158 +102,290 @@ class _HeldOutTracker:
                 self.kept = arrays_of(state, self.problem.backend)
 
 
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """The views of a fit, and those kept back.
+
+    Attributes:
+        told: geometry of all views, with an angle of each row.
+        data, weights: of all views, finite; weights of a mean of about 1 on matter.
+        used, kept_back: numbers of views.
+        joined: pixels that are joined for the steps.
+        seen: geometry of the views that the steps see, `p` their line integrals, `known` their weights.
+        field: box of the Gaussians.
+        count: Gaussians at the start.
+        fitted: what the finish sees.
+    """
+
+    told: Geometry
+    data: F32
+    weights: F32 | None
+    used: NDArray[np.intp]
+    kept_back: NDArray[np.intp]
+    joined: int
+    seen: Geometry
+    p: F32
+    known: F32 | None
+    field: Grid
+    count: int
+    fitted: ReconProblem
+
+    @classmethod
+    def of(cls, method: FitMethod, problem: ReconProblem) -> _Views:
+        # Slices that turn against each other are a twist of the model: the fit sees all rows at the angle of the first.
+        told, geometry = problem.geometry, problem.geometry.at_row(0)
+        if told.skew and isinstance(method.gaussians, Gaussians):
+            raise ValueError(
+                "Gaussians to start from are not taken where rows see angles of their own: give their number"
+            )
+        if geometry.width and problem.device != "cpu":
+            warnings.warn(
+                f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows "
+                f"{geometry.width}",
+                stacklevel=3,
+            )
+            geometry = geometry.seen_with(NO_WIDTH)
+        used, kept_back = split_views(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
+        data, weights = masked(problem.projections, problem.use.weights)
+        if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
+            weights = weights / np.float32(_usual(weights, data))
+        blank = kept_back[~data[kept_back].any(axis=(1, 2))]
+        if blank.size:
+            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
+        views, start = geometry.select(used), method.gaussians
+        pixel_grid = Grid.for_fit(geometry, problem.grid)
+        usual = default_count(views, pixel_grid.voxel_size)
+        count = start.n if isinstance(start, Gaussians) else start or usual
+        joined = method.fit.joined_pixels or joined_for(
+            pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
+        )  # fmt: skip
+        measured, trusted = data[used], None if weights is None else weights[used]
+        p, known, seen = join_pixels(measured, trusted, views, joined)
+        field = Grid.for_fit(seen, problem.grid, wider=leaves_the_field(measured, views))
+        fitted = replace(problem, projections=measured, geometry=told.select(used), use=DataUse(trusted))
+        return cls(told, data, weights, used, kept_back, joined, seen, p, known, field, count, fitted)
+
+    def unseen(self, problem: FitProblem, settings: FitSettings, unit: float) -> FitProblem | None:
+        """The views kept back, as the steps see theirs."""
+        if not self.kept_back.size:
+            return None
+        weights = None if self.weights is None else self.weights[self.kept_back]
+        geometry = self.told.at_row(0).select(self.kept_back).seen_with(self.seen.width)
+        q, others, apart = join_pixels(self.data[self.kept_back], weights, geometry, self.joined)
+        return fit.problem_of(q, apart, self.field, unit, settings, problem.backend, others)
+
+
+@dataclass(eq=False)
+class _Length:
+    """How long a fit takes.
+
+    Attributes:
+        steps: end the fit; None: only `seconds` end it.
+        seconds: of the steps, by the caller's clock; None: `steps` alone end it.
+        sweeps: of the finish; None: as it takes by default.
+        trials: the finish may try priors.
+        planned: the seconds are divided among steps and finish.
+    """
+
+    steps: int | None
+    seconds: float | None
+    sweeps: int | None
+    trials: bool
+    planned: bool
+
+    def fraction(self, step: int, spent: float) -> float:
+        """How far the fit has come after so many steps and seconds, 0..1."""
+        by_steps = step / self.steps if self.steps else 0.0
+        return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
+
+    def plan(self, plan: FinishPlan, spent: float) -> None:
+        """Keep time for the finish."""
+        self.sweeps, finishing, self.trials = plan
+        self.planned = True
+        if self.seconds is not None:
+            self.seconds = max(spent, self.seconds - finishing)
+
+
+@dataclass(eq=False)
+class _Run:
+    """A fit on its way: what its phases share."""
+
+    method: FitMethod
+    problem: ReconProblem
+    control: RunControl
+    decide: Decisions
+    views: _Views
+    begin: float
+    end: float
+    state: FitState
+    fitting: FitProblem
+    tracker: _HeldOutTracker
+    length: _Length
+    history: list[Progress] = field(default_factory=list)
+
+    @property
+    def stopped(self) -> bool:
+        return self.control.should_stop is not None and self.control.should_stop()
+
+    def model(self) -> tuple[Volume, Gaussians]:
+        """The volume of the Gaussians, and these, turned as the rows see them."""
+        model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.views.told, 1)
+        filled = voxelize(model, self.problem.grid, truncation=self.method.fit.truncation).numpy()
+        return Volume(filled, self.problem.grid), model
+
+    def report(self, at: float) -> None:
+        state = self.state
+        self.history.append(
+            Progress(
+                state.step, self.length.steps or 0, at - self.begin, float(state.loss), float(state.residual), state.n,
+                self.views.seen.n_views, self.tracker.value,
+            )
+        )  # fmt: skip
+        if self.control.on_progress is not None:
+            self.control.on_progress(self.history[-1])
+
+    def checkpoint(self, state: FitState) -> dict[str, NDArray[Any]]:
+        return arrays_of(state, self.fitting.backend) | self.tracker.arrays() | decisions_of(self.decide.made, _DECIDED)
+
+
 def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Fit the line integrals of a problem; see `R2`.
+
+    Where the length of the fit is not given, views held out tell whether it predicts better than voxels do. If not, it
+    is a short one, and its volume is that of the better prior on voxels, see `finish.best_candidate`.
 
     Raises:
         ValueError: for a problem that the method cannot be fitted to.
     """
-    # Slices that turn against each other are a twist of the model: the fit sees all rows at the angle of the first.
-    now, settings, told, geometry = control.now, method.fit, problem.geometry, problem.geometry.at_row(0)
-    if told.skew and isinstance(method.gaussians, Gaussians):
-        raise ValueError("Gaussians to start from are not taken where rows see angles of their own: give their number")
-    if geometry.width and problem.device != "cpu":
-        warnings.warn(
-            f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows {geometry.width}",
-            stacklevel=2,
-        )
-        geometry = geometry.seen_with(NO_WIDTH)
-    begin, decide = now(), control.decide or Decisions(problem.seed)
-    sweeps = method.finish_sweeps
-    held_out = tuple(problem.use.held_out)
-    backend = backend_for(problem.device)
-    used, kept_back = split_views(geometry.n_views, held_out, method.early_stop)
-    data, weights = masked(problem.projections, problem.use.weights)
-    if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
-        weights = weights / np.float32(_usual(weights, data))
-    blank = kept_back[~data[kept_back].any(axis=(1, 2))]
-    if blank.size:
-        raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
-    views = geometry.select(used)
-    wider = leaves_the_field(data[used], views)
-    start, pixel_grid = method.gaussians, Grid.for_fit(geometry, problem.grid)
-    usual = default_count(views, pixel_grid.voxel_size)
-    count = start.n if isinstance(start, Gaussians) else usual if start is None else start
-    joined = settings.joined_pixels or joined_for(
-        pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
-    )  # fmt: skip
-    measured, trusted = data[used], None if weights is None else weights[used]
-    p, known, seen = join_pixels(measured, trusted, views, joined)
-    field_grid = Grid.for_fit(seen, problem.grid, wider=wider)
+    begin, decide = control.now(), control.decide or Decisions(problem.seed)
+    views = _Views.of(method, problem)
+    decide.preset(decisions_from(control.resume or {}))
+    fit_at = len(_ON_VOXELS)
+    at = int(decide("candidate", lambda: _candidate(method, views, control, decide))) if method.by_content else fit_at
+    run = _started(method, problem, control, decide, views, begin)
+    if at < fit_at:
+        run.length.steps = MODEL_STEPS
+    n_start = run.state.n
+    _steps(run)
+    last = run.state
+    if run.tracker.kept:
+        run.state = state_from(run.tracker.kept, run.fitting.backend)
+    volume, model = run.model()
+    made_by, sweeps = method.name, 0
+    if at < fit_at and not run.stopped:
+        volume, made_by = _of_voxels(run, at)
+    elif at == fit_at:
+        volume, sweeps = _finished(run, volume, model)
+    settings, state = method.fit, run.state
+    record = {
+        **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
+        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": tuple(problem.use.held_out),
+        "device": problem.device, "finish": sweeps, "volume_by": made_by, "joined_pixels": views.joined,
+        "tv_weight": tv_weight(settings, run.fitting, state.limit), "tv_size": tv_size(settings, views.field),
+    }  # fmt: skip
+    return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last))
+
+
+def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: Decisions) -> int:
+    """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
+
+    def short(part: ReconProblem, watched: RunControl) -> Reconstruction:
+        rows = part.geometry.detector_shape[0] / views.told.detector_shape[0]
+        count = max(1, round(rows * method.gaussians)) if isinstance(method.gaussians, int) else None
+        return run_fit(method.fit_alone(count), part, watched)
+
+    at, prior = best_candidate(views.fitted, method.fit, control, short)
+    decide.preset(prior)
+    return at
+
+
+def _started(
+    method: FitMethod, problem: ReconProblem, control: RunControl, decide: Decisions, views: _Views, begin: float
+) -> _Run:
+    """The fit before its first step, or as a checkpoint holds it."""
+    now, settings, start, backend = control.now, method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
-        factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
+        factor = 1 if method.seconds is None else _factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
             start = place(
-                p, seen, field_grid, count, np.random.default_rng(problem.seed), start=method.start,
+                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed), start=method.start,
                 rays=settings.rays, kernel=settings.kernel, factor=factor,
             )  # fmt: skip
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
-        state = _resumed(control.resume, geometry.n_views, backend)
-    n_start, unit = state.n, state.unit
-    fitting = fit.problem_of(p, seen, field_grid, unit, settings, backend, known)
+        state = _resumed(control.resume, problem.geometry.n_views, backend)
+    fitting = fit.problem_of(views.p, views.seen, views.field, state.unit, settings, backend, views.known)
     if settings.tv_weight is None:
-        fitting = replace(fitting, change=decide("change", lambda: mean_change(p, seen, field_grid)))
-    unseen = None
-    if kept_back.size:
-        others = None if weights is None else weights[kept_back]
-        q, others, apart = join_pixels(data[kept_back], others, geometry.select(kept_back), joined)
-        unseen = fit.problem_of(q, apart, field_grid, unit, settings, backend, others)
+        fitting = replace(fitting, change=decide("change", lambda: mean_change(views.p, views.seen, views.field)))
+    unseen = views.unseen(fitting, settings, state.unit)
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
-
-    by_content = method.least_steps != method.planned_steps
-    wanted, trials, planned, seconds = method.finish, True, sweeps == 0 or method.seconds is None, method.seconds
+    seconds = method.seconds
     if seconds is not None:
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
-    schedule = Schedule(method.planned_steps, seconds, by_content)
-    schedule = Schedule.resumed(schedule, control.resume or {})
-    # The trial costs more than all steps on joined pixels.
-    tries_finish = by_content and method.finish is None and joined == 1
-    tries_finish = tries_finish and not (wider or method.early_stop or seen.is_cone)
-    fitted = replace(problem, projections=measured, geometry=told.select(used), use=DataUse(trusted))
-    history: list[Progress] = []
+    planned = method.finish_sweeps == 0 or method.seconds is None
+    length = _Length(method.planned_steps, seconds, method.finish, True, planned)
+    return _Run(method, problem, control, decide, views, begin, end, state, fitting, tracker, length)
 
-    def of_model() -> tuple[Volume, Gaussians]:
-        model = turned_by_rows(fit.gaussians_of(state, backend), told, 1)
-        return Volume(voxelize(model, problem.grid, truncation=settings.truncation).numpy(), problem.grid), model
 
-    def trial() -> list[float] | None:
-        found = try_finish(*of_model(), fitted, settings, control)
-        return None if found is None else list(found)
-
-    def report(at: float) -> None:
-        history.append(
-            Progress(
-                state.step, schedule.steps or 0, at - begin, float(state.loss), float(state.residual), state.n,
-                seen.n_views, tracker.value, least_steps=schedule.least(state.step, tries_finish),
-            )
-        )  # fmt: skip
-        if control.on_progress is not None:
-            control.on_progress(history[-1])
-
-    fit_begin = reported = saved = now()
+def _steps(run: _Run) -> None:
+    """The steps of the fit, to its end or until it is stopped."""
+    now, length, state, method = run.control.now, run.length, run.state, run.method
+    begin = reported = saved = now()
     done = 0
-    while schedule.steps is None or state.step < schedule.steps:
-        if tries_finish and state.step == TRIAL_AT and schedule.trial is None:
-            found = decide("fit", trial)
-            schedule.after_trial(None if found is None else FinishTrial.of(found), state.step)
-        # Before a further step: a fit that was left during its trial makes it again.
-        if (done or state.step == TRIAL_AT) and control.should_stop is not None and control.should_stop():
+    while length.steps is None or state.step < length.steps:
+        spent = now() - begin
+        if done and (run.stopped or (length.seconds is not None and spent >= length.seconds)):
             break
-        spent = now() - fit_begin
-        if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
-            break
-        fraction = schedule.fraction(state.step, spent)
-        fit.step(state, fitting, settings, fraction)
+        fit.step(state, run.fitting, method.fit, length.fraction(state.step, spent))
         done += 1
-        if not planned and done == _TIMED and schedule.seconds is not None:
-            spent = now() - fit_begin
-            left, step, planned = schedule.seconds - spent, spent / done, True
-            finish_in_time = partial(_finish_in_time, method, views, problem.grid, now, left, step)
-            wanted, finishing, trials = decide("finish", finish_in_time)
-            schedule.seconds = max(spent, schedule.seconds - finishing)
-        schedule.look(state, fitting)
+        if not length.planned and done == _TIMED and length.seconds is not None:
+            spent = now() - begin
+            left, step = length.seconds - spent, spent / done
+            length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, left, step))), spent)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
-            tracker.look(state, method.early_stop)
+            run.tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
-            report(reported)
-        if control.on_checkpoint is not None and now() - saved >= control.checkpoint_every:
-            control.on_checkpoint(arrays_of(state, backend) | tracker.arrays() | schedule.arrays())
+            run.report(reported)
+        if run.control.on_checkpoint is not None and now() - saved >= run.control.checkpoint_every:
+            run.control.on_checkpoint(run.checkpoint(state))
             saved = now()  # the time that saving takes must not crowd out the fit
-        if method.early_stop and state.step - tracker.best_step > max(6 * _LOOK, _PATIENCE * (schedule.steps or 0)):
+        patience = max(6 * _LOOK, _PATIENCE * (length.steps or 0))
+        if method.early_stop and state.step - run.tracker.best_step > patience:
             break
-    tracker.look(state, method.early_stop)
-    report(now())
-    last = state
-    if tracker.kept:
-        state = state_from(tracker.kept, backend)
-    volume, model = of_model()
-    if not planned:  # the fit has ended before
-        left = end - now()
-        wanted, _, trials = decide("finish", lambda: _finish_in_time(method, views, problem.grid, now, left, 0.0))
-    if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
-        sweeps = 0
-    if sweeps:
-        if method.seconds is not None:
-            control = replace(control, should_stop=_until(control, end))
-        control = replace(control, stop_trials=None if trials else lambda: True)
-        finished, sweeps = finish(
-            volume, model, fitted, wanted, settings, control, not method.allow_negative, schedule.trial
-        )
-        if kept_back.size and _worse(finished, volume, data[kept_back], told.select(kept_back)):
-            sweeps = 0
-        else:
-            volume = finished
-    record = {
-        **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
-        "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
-        "finish": sweeps, "joined_pixels": joined, "tv_weight": tv_weight(settings, fitting, state.limit),
-        "tv_size": tv_size(settings, field_grid),
-    }  # fmt: skip
-    checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()
-    return Reconstruction(volume, record, tuple(history), model, checkpoint)
+    run.tracker.look(state, method.early_stop)
+    run.report(now())
+
+
+def _of_voxels(run: _Run, at: int) -> tuple[Volume, str]:
+    """The volume of a method on voxels, and its name."""
+    method = _ON_VOXELS[at](allow_negative=run.method.allow_negative)
+    made = method.run(run.views.fitted, replace(run.control, decide=run.decide))
+    return made.volume, method.name
+
+
+def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]:
+    """The volume of the fit, refined on voxels where time is left for it, and the sweeps."""
+    method, length, now, kept_back = run.method, run.length, run.control.now, run.views.kept_back
+    if method.finish_sweeps == 0:
+        return volume, 0
+    if not length.planned:  # the fit has ended before
+        length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, run.end - now(), 0.0))), 0.0)
+    if length.sweeps == 0 or now() >= run.end or run.stopped:
+        return volume, 0
+    control = replace(run.control, decide=run.decide)
+    if method.seconds is not None:
+        control = replace(control, should_stop=_until(control, run.end))
+    control = replace(control, stop_trials=None if length.trials else lambda: True)
+    finished, sweeps = finish(
+        volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative
+    )  # fmt: skip
+    if kept_back.size:
+        views = run.views.told.select(kept_back)
+        if _worse(finished, volume, run.views.data[kept_back], views):
+            return volume, 0
+    return finished, sweeps
 
 
 def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
@@ -275,13 +413,12 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     return factor
 
 
-def _finish_in_time(
-    method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
-) -> FinishPlan:
+def _finish_in_time(run: _Run, left: float, step: float) -> FinishPlan:
     """The sweeps of the finish and their seconds, if `left` seconds remain after first steps of `step` seconds each.
     `finish_within` gives the sweeps; if the time suffices for two, the method's own number is used."""
-    room = FINISH_SHARE * left
-    plan = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
+    method, room = run.method, FINISH_SHARE * left
+    geometry = run.views.fitted.geometry.at_row(0)
+    plan = finish_within(room, left - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
     return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
 
 

@@ -1,11 +1,15 @@
-"""mlem: the activity of a sample that emits (PET, SPECT), from counts with Poisson likelihood; with subsets OSEM."""
+"""mlem: the activity of a sample that emits (PET, SPECT), from counts with Poisson likelihood; with subsets OSEM.
+
+`passes_by_halves` says after how many passes over the views activity is nearest to the truth.
+"""
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -114,23 +118,29 @@ def mlem(
         ValueError: no iterations, or other subsets than 1 to the number of views. Counts that are zero everywhere. A
             line with counts whose mean is zero whatever the activity. Survival so small that float32 overflows.
     """
-    views = emission.geometry.n_views
     if operator.index(iterations) < 1:
         raise ValueError(f"iterations must be 1 or more, got {iterations}")
-    if not 1 <= operator.index(subsets) <= views:
-        raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
-    if not emission.counts.any():
-        raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
-    whole = Projector(emission.geometry, grid)
-    parts = []
-    for some in interleaved(whole, subsets):
-        projector = whole.subset(some)
-        if emission.survival is None:
-            survival = np.ones(projector.projection_shape, np.float32)
-        else:
-            survival = emission.survival[some]
-        background = np.float32(0) if emission.background is None else emission.background[some]
-        parts.append(_Subset(projector, emission.counts[some], survival, background, projector.adjoint(survival)))
+    x, scale = np.zeros(grid.shape, np.float32), float(np.linalg.norm(emission.counts))
+    for iteration, done in enumerate(islice(_passes(emission, grid, subsets), iterations), start=1):
+        x = done.activity
+        if on_iteration is not None and on_iteration(iteration, done.likelihood, math.sqrt(done.squares) / scale):
+            break
+    return Volume(x, grid)
+
+
+class _Pass(NamedTuple):
+    """After a pass over all views: `activity` [z, y, x], which the next one overwrites, and of that before it, each
+    view at its turn, L and Σ (counts - mean)².
+    """
+
+    activity: F32
+    likelihood: float
+    squares: float
+
+
+def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
+    """The passes of `mlem`, without end."""
+    parts = _subsets(emission, grid, subsets)
     most = max(float(part.sensitivity.max()) for part in parts)
     if most == 0:
         raise ValueError("no line sees the grid: survival is 0 everywhere, or the lines miss it")
@@ -145,8 +155,7 @@ def mlem(
             "numbers of float32. Expected the share of pairs that a line counts, such as 0.3"
         )
     x *= np.float32(level)
-    scale = float(np.linalg.norm(emission.counts))
-    for iteration in range(1, iterations + 1):
+    while True:
         likelihood = squares = 0.0
         for projector, counts, survival, background, sensitivity in parts:
             mean = survival * projector.forward(x) + background
@@ -161,9 +170,88 @@ def mlem(
             x *= np.divide(
                 projector.adjoint(survival * ratio), sensitivity, out=np.ones_like(x), where=sensitivity > least
             )
-        if on_iteration is not None and on_iteration(iteration, likelihood, math.sqrt(squares) / scale):
+        yield _Pass(x, likelihood, squares)
+
+
+def _subsets(emission: Emission, grid: Grid, subsets: int) -> list[_Subset]:
+    views = emission.geometry.n_views
+    if not 1 <= operator.index(subsets) <= views:
+        raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
+    if not emission.counts.any():
+        raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
+    whole, parts = Projector(emission.geometry, grid), []
+    for some in interleaved(whole, subsets):
+        projector = whole.subset(some)
+        if emission.survival is None:
+            survival = np.ones(projector.projection_shape, np.float32)
+        else:
+            survival = emission.survival[some]
+        background = np.float32(0) if emission.background is None else emission.background[some]
+        parts.append(_Subset(projector, emission.counts[some], survival, background, projector.adjoint(survival)))
+    return parts
+
+
+def passes_by_halves(
+    emission: Emission,
+    grid: Grid,
+    subsets: int,
+    most: int,
+    rng: np.random.Generator,
+    go_on: Callable[[int], bool] = lambda done: True,
+) -> int | None:
+    """The iterations of `mlem`, up to `most`, after which activity is nearest to the truth, by counts held out.
+
+    Each count goes to one of two halves by a coin, which makes them independent Poisson counts of half the mean
+    (Kingman 1993, Poisson Processes, section 5.1), of all lines. Activity x of one half meets lines q = (y - b) / s of
+    the other, whose noise it does not know. Along rows of pixels, with |ω| as in FBP,
+
+        Σ |ω| |F(q - A x)|²  =  Σ |ω| |F(A x - A truth)|² + noise of q     on average
+
+    and the first sum on the right is |x - truth|², up to a factor (Natterer 1986, The Mathematics of Computerized
+    Tomography, section II.1). Without |ω|, or by the likelihood, lines are compared, which hardly show the noise of a
+    volume: two to three times as many iterations have the least error then. The search ends where the sum rises.
+
+    Memory: as `mlem`, and 6 x the projections.
+
+    Args:
+        go_on: called with the number of each iteration; False ends the search there.
+
+    Returns:
+        None: counts are not whole numbers, so that they are not Poisson's; or a half has none.
+    """
+    counts = emission.counts
+    if not (np.rint(counts) == counts).all():
+        return None
+    kept = rng.binomial(counts.astype(np.int64), 0.5).astype(np.float32)
+    if not kept.any():
+        return None
+    half = replace(
+        emission,
+        survival=np.full_like(counts, 0.5) if emission.survival is None else emission.survival * np.float32(0.5),
+        background=None if emission.background is None else emission.background * np.float32(0.5),
+    )
+    survival, other = half.survival, counts - kept
+    assert survival is not None
+    if half.background is not None:
+        other -= half.background
+    lines = np.divide(other, survival, out=np.zeros_like(other), where=survival > 0)
+    whole, least, best = Projector(emission.geometry, grid), math.inf, 0
+    for n, done in enumerate(islice(_passes(replace(half, counts=kept), grid, subsets), most), start=1):
+        missed = np.where(survival > 0, lines - whole.forward(done.activity), np.float32(0))
+        error = _error_of_images(missed)
+        if error >= least:
             break
-    return Volume(x, grid)
+        least, best = error, n
+        if not go_on(n):
+            break
+    return best
+
+
+def _error_of_images(missed: F32) -> float:
+    """Σ |ω| |F|² over the rows of pixels [view, row, col]."""
+    columns = 2 * missed.shape[-1]  # padded, so that ends of a row do not meet
+    spectrum = np.fft.rfft(missed, columns)
+    return float(np.sum(np.fft.rfftfreq(columns) * (spectrum.real**2 + spectrum.imag**2), dtype=np.float64))
 
 
 def weighted_lines(emission: Emission) -> tuple[F32, F32]:

@@ -17,7 +17,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out_weight import busiest_rows
+from recon.voxels.held_out import busiest_rows
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
@@ -145,6 +145,17 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         on_iteration=report, on_trial=control.stop_trials or control.should_stop, decide=decide,
     )  # fmt: skip
     return Reconstruction(volume, {**settings, "seed": problem.seed}, tuple(history))
+
+
+def prior_decisions(made: Mapping[str, Sequence[Any]]) -> dict[str, Sequence[Any]]:
+    """Decisions on the prior that hold for other methods on the same views, with their units.
+
+    A weight by the noise does not, since it follows from sums over a volume, nor one that was given, which is a number.
+    """
+    weight = (made.get("weight") or [None])[0]
+    if not (isinstance(weight, list) and len(weight) == 1):
+        return {}
+    return {name: made[name][:1] for name in (UNITS, "weight", "strength") if made.get(name)}
 
 
 class _Units(NamedTuple):

@@ -16,9 +16,9 @@ from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit
 
 MATTER = 0.05  # of the density unit: voxels above it count
-EXPLAINED = 1.05
-"""Residual over the noise up to which a volume explains its views. On eight scans that voxels explain it is 0.75 to
-1.0. On seven cones of coarse voxels it is 1.16 to 5.6, on three regions of interest 3 to 7."""
+# Residual over the noise up to which a volume explains its views. On eight scans that voxels explain it is 0.75 to 1.0.
+# On seven cones of coarse voxels it is 1.16 to 5.6, on three regions of interest 3 to 7.
+_EXPLAINED = 1.05
 
 # From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue), within 0.4 dB of the best weight on average.
 # They had 25 to 400 views, 500 to 100 000 photons a pixel, white noise and noise blurred by half a pixel.
@@ -27,9 +27,6 @@ _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
 # Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many. It gives +1.0,
 # +0.7, -0.6 dB on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-# The part of the views that no volume explains, where it is known before. It gives +0.1 to +2.8 dB on seven of eight
-# cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
-_KNOWN_BEFORE = 2.5
 # Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
 # gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
 # band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
@@ -53,14 +50,12 @@ class NoiseBalance:
         first: the weight to begin with.
         noise: of a ray, with which the residual is compared: `noise_beside_structure` of the data. For many views it is
             up to 1.3 times that (π / 2 times the columns determine a slice). Then little of it fits into a volume.
-        counted: what no volume explains was known before, and is in the first weight.
         settled: sweeps after which the residual is looked at. Before, a method that has not converged seems to leave
             what no volume explains. Then the weight would be too heavy, and the residual large, up to the end.
     """
 
     first: float
     noise: float
-    counted: bool = False
     settled: int = 3
     value: float = field(init=False)
     _sweeps: int = field(default=0, init=False)
@@ -70,16 +65,12 @@ class NoiseBalance:
         self.value = self.first
 
     @classmethod
-    def of(
-        cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float | None = None, evenly: bool = True
-    ) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, evenly: bool = True) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
             modelled: the start is a model of the sample. Then what it leaves of the data bounds the noise, which fine
                 structure, or a scan of few rows, makes too large.
-            unmodelled: standard deviation of what no voxels explain of the views, in units of the noise, where it is
-                known. It is large at few rays, so that the first weight rises with its square.
             evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
                 views is alike.
         """
@@ -93,8 +84,7 @@ class NoiseBalance:
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        first_weight = share * (1 + (_KNOWN_BEFORE * (unmodelled or 0.0)) ** 2)
-        return cls(first_weight, noise * _by_views(problem.projector.geometry), unmodelled is not None)
+        return cls(share, noise * _by_views(problem.projector.geometry))
 
     def after_sweep(self, residual: F32) -> float:
         """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""
@@ -104,8 +94,8 @@ class NoiseBalance:
             return self.value
         self._least = min(self._least, deviation / self.noise)
         factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
-        if self._sweeps >= self.settled and not self.counted and self._least > EXPLAINED:
-            factor = min(1 + _FOUND**2 * (self._least**2 - EXPLAINED**2), _MOST_BY_FOUND)
+        if self._sweeps >= self.settled and self._least > _EXPLAINED:
+            factor = min(1 + _FOUND**2 * (self._least**2 - _EXPLAINED**2), _MOST_BY_FOUND)
         self.value = self.first * factor
         return self.value
 

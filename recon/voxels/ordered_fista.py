@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -95,35 +95,6 @@ def ordered_fista(
             break
         ahead(x)
     return x
-
-
-def bregman(problem: VoxelProblem, x: F32, weight: float, subsets: Subsets, *, sweeps: int, tv_steps: int) -> F32:
-    """Two runs of `ordered_fista`; the second adds the first one's residual to the views: 2 p - A x₁.
-
-    Bregman iteration (Osher, Burger, Goldfarb, Xu & Yin 2005, Multiscale Model. Simul. 4, 460, eq. 3.1 to 3.3). Total
-    variation takes contrast from every structure, most from small ones. The residual holds this contrast; the second
-    run restores it. The residual does not grow from run to run (their proposition 3.2). The first run needs a heavy
-    weight, at which its volume has little noise.
-
-    Args:
-        x, subsets: as `ordered_fista`.
-        weight: μ of both runs.
-        sweeps: of each run; if `problem.go_on` ends the first run, there is no second.
-    """
-    ended = False
-
-    def first(sweep: int, residual: float) -> bool:
-        nonlocal ended
-        ended = not problem.go_on(sweep, residual)
-        return not ended
-
-    x = ordered_fista(replace(problem, go_on=first), x, weight, subsets, sweeps=sweeps, tv_steps=tv_steps)
-    if ended:
-        return x
-    more = problem.projector.forward_lines(x)
-    combine(2.0, problem.data, -1.0, more, more)
-    again = replace(problem, data=more, go_on=lambda sweep, residual: problem.go_on(sweeps + sweep, residual))
-    return ordered_fista(again, x, weight, subsets, sweeps=sweeps, tv_steps=tv_steps)
 
 
 def subsets_of(geometry: Geometry, most: int) -> int:

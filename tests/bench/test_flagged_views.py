@@ -18,10 +18,10 @@ from click.testing import CliRunner
 import recon
 from beamline.cli.main import main
 from beamline.config.load import config_folder
-from beamline.projections import flags
+from beamline.projections.corrections import flags
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules import treatment
 from recon.base.method import DataUse

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import recon
+from beamline.projections.corrections.rings import Rings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.rings import Rings
 from beamline.storage.readers.open import open_scan
 from recon.base import choices
 from tests.bench.quality_cases import F32

@@ -13,14 +13,14 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.width import Width
 from beamline.projections.prepare import prepare_projections
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.calibrate import Calibrate
-from beamline.projections.steps.step import PrepStep
-from beamline.projections.steps.width import Width
 from beamline.storage.readers.open import open_scan
-from recon.voxels.held_out_weight import split_views
+from recon.voxels.held_out import split_views
 from recon.voxels.projector import Projector
 from tests.recon.prep.ring_score import ring_score
 

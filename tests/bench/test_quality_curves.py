@@ -28,7 +28,7 @@ from recon.splatting.finish import SWEEPS
 from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out_weight import choice_sweeps
+from recon.voxels.held_out import choice_sweeps
 from recon.warm_up import warm_up
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom

@@ -12,9 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 
 pytestmark = pytest.mark.bench

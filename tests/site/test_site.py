@@ -107,7 +107,7 @@ with warnings.catch_warnings(record=True) as told:
     from simulators.scenes.scene import load_scene
     names = methods.names()
     text = suffixes_text()
-    from beamline.projections.steps.registry import all_steps
+    from beamline.projections.registry import all_steps
     steps = [step.name for step in all_steps()]
     from simulators.wires.registry import WIRES
 

@@ -1,1 +1,1 @@
-"""Steps: corrections of views, one a file; `registry` has a line for each."""
+"""The place that plug-ins import a step's values from: `step` here. New ones import `beamline.projections.step`."""

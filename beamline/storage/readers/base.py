@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.monitor.digest import LARGEST
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.writers.ending import ScanEnding
@@ -257,20 +258,36 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
 
 
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-    """As `source.read`, with NaN (0 of whole numbers) for frames that the file does not give: see its `unreadable`."""
+    """As `source.read`, with NaN (0 of whole numbers) for frames that the file does not give: see its `unreadable`.
+
+    A real number beyond LARGEST, which no detector counts and which float32 may not hold, is NaN, too.
+    """
     try:
-        return source.read(frames) if rows == WHOLE else source.read(frames, rows)
+        return _measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
     except UnreadableError:
         indices = frame_indices(frames, int(source.image_key.size))
     out = np.zeros((indices.size, len(range(source.shape[0])[rows]), source.shape[1]), source.dtype)
     for image, row in zip(out, indices.tolist(), strict=True):
         try:
-            image[...] = source.read([row], rows)[0]
+            image[...] = _measured(source.read([row], rows))[0]
         except UnreadableError as error:
             source.unreadable = {**source.unreadable, row: str(error)}
             if source.dtype.kind == "f":
                 image[...] = np.nan
     return out
+
+
+def _measured(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Pixels [frame, row, col] with NaN for real numbers beyond LARGEST."""
+    if pixels.dtype.kind != "f":
+        return pixels
+    most = min(LARGEST, float(np.finfo(pixels.dtype).max))  # float16 does not hold LARGEST
+    for number, image in enumerate(pixels):
+        if (beyond := np.abs(image) > most).any():
+            if not pixels.flags.writeable:
+                pixels = pixels.copy()
+            pixels[number][beyond] = np.nan
+    return pixels
 
 
 class LookedEnoughError(DataError):

@@ -16,7 +16,7 @@ from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_degrees
 
-_FARTHEST = 1e6  # degrees
+FARTHEST = 1e6  # degrees
 _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
@@ -55,11 +55,11 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
     if angles.size < 2 or not np.isfinite(angles).all():
         return
     farthest = float(np.abs(angles).max()) * 180 / np.pi
-    if farthest > _FARTHEST:
+    if farthest > FARTHEST:
         yield Finding(
             "error",
             "angle-spread",
-            f"The projections are at up to {farthest:.3g} degrees; expected at most {_FARTHEST:g}, beyond which "
+            f"The projections are at up to {farthest:.3g} degrees; expected at most {FARTHEST:g}, beyond which "
             "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
         )
         return

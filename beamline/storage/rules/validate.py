@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
+from beamline.monitor.digest import LARGEST
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.interrupted import next_step
@@ -243,13 +244,18 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
     views = _sample(source, FrameKind.PROJECTION)
     if views is None:
         return
-    finite = np.isfinite(views)
+    finite = np.abs(views, dtype=np.float64) <= LARGEST
     if not finite.any():
-        yield Finding("error", "pixels", "No finite pixel in the projections looked at: they are all NaN or infinite.")
+        said = f"No finite pixel in the projections looked at: they are all NaN, infinite or beyond {LARGEST:g}."
+        yield Finding("error", "pixels", said)
     elif float(views[finite].min()) == float(views[finite].max()):
         yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
     elif not finite.all():
-        yield Finding("warning", "pixels", f"{1 - finite.mean():.3%} of the pixels looked at are NaN or infinite.")
+        yield Finding(
+            "warning",
+            "pixels",
+            f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
+        )
     if source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",

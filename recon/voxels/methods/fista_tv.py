@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -10,7 +11,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.voxels.held_out_weight import choose_weight
+from recon.voxels.held_out import HeldOutTrial, choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
@@ -53,15 +54,17 @@ class FistaTv:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         return self.with_weight(problem, x)[0]
 
-    def with_weight(self, problem: VoxelProblem, x: F32) -> tuple[F32, float]:
-        """`iterate`, and the weight μ of its last sweep."""
+    def with_weight(
+        self, problem: VoxelProblem, x: F32, trial: Callable[[], HeldOutTrial | None] | None = None
+    ) -> tuple[F32, NoiseBalance | float]:
+        """`iterate`, and the weight μ; `trial`: as of `choose_weight`."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
         if self.tv_weight is None:
-            weight = choose_weight(problem, x, modelled=False, of_cones=True)
+            weight = choose_weight(problem, x, modelled=False, trial=trial)
         else:
             share = self.tv_weight
             weight = problem.decide(
@@ -69,7 +72,7 @@ class FistaTv:
             )
         subsets = Subsets.of(problem, self.subsets)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
-        return x, weight.value if isinstance(weight, NoiseBalance) else weight
+        return x, weight
 
     def toy(self) -> Self:
         return replace(self, iterations=1)

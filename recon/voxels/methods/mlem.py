@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import ClassVar, Self
 
@@ -11,8 +12,11 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.voxels.emission import Emission, mlem
+from recon.voxels.emission import Emission, mlem, passes_by_halves
 from recon.voxels.voxel_problem import iterative_memory
+
+UPDATES = 200
+"""Of the volume, by all subsets: where counts do not say how many, and the most that they may ask for."""
 
 _FLOOR = 1e-6  # of the mean line integral
 
@@ -22,13 +26,17 @@ class Mlem:
     """See `recon.voxels.emission.mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
 
     Line integrals that come without counts are taken for counts with their weights as survival.
+
+    Attributes:
+        iterations: passes over all views; None: as counts held out prefer, see `passes_by_halves`, or 200 updates of
+            the volume, where these are no counts.
     """
 
     name: ClassVar[str] = "mlem"
     label: ClassVar[str] = "MLEM"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(own_length=True)
 
-    iterations: int = 50
+    iterations: int | None = None
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return _run(self, problem, control, 1)
@@ -46,13 +54,13 @@ class Osem:
 
     name: ClassVar[str] = "osem"
     label: ClassVar[str] = "OSEM"
-    traits: ClassVar[Traits] = Traits()
+    traits: ClassVar[Traits] = Traits(own_length=True)
 
-    iterations: int = 20
-    subsets: int = 10
+    iterations: int | None = None
+    subsets: int = 4
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return _run(self, problem, control, self.subsets)
+        return _run(self, problem, control, min(self.subsets, problem.geometry.n_views))
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
@@ -65,15 +73,28 @@ def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subset
     begin, views = control.now(), problem.geometry.n_views
     history: list[Progress] = []
 
+    def go_on(progress: Progress) -> bool:
+        if control.on_progress is not None:
+            control.on_progress(progress)
+        return control.should_stop is None or not control.should_stop()
+
+    def tried(done: int) -> bool:
+        seconds = control.now() - begin
+        return go_on(Progress(done, 0, seconds, math.nan, math.nan, 0, views, unit="iterations tried on half"))
+
     def report(iteration: int, likelihood: float, residual: float) -> bool:
         seconds = control.now() - begin
-        history.append(Progress(iteration, method.iterations, seconds, -likelihood, residual, 0, views))
-        if control.on_progress is not None:
-            control.on_progress(history[-1])
-        return control.should_stop is not None and control.should_stop()
+        history.append(Progress(iteration, iterations, seconds, -likelihood, residual, 0, views))
+        return not go_on(history[-1])
 
-    volume = mlem(_emission(problem), problem.grid, method.iterations, min(subsets, views), report)
-    return Reconstruction(volume, {f.name: getattr(method, f.name) for f in fields(method)}, tuple(history))
+    emission, most = _emission(problem), max(1, UPDATES // subsets)
+    iterations = most if method.iterations is None else method.iterations
+    if method.iterations is None and problem.use.emission is not None:
+        rng = np.random.default_rng(problem.seed)
+        iterations = passes_by_halves(emission, problem.grid, subsets, most, rng, tried) or most
+    volume = mlem(emission, problem.grid, iterations, subsets, report)
+    settings = {f.name: getattr(method, f.name) for f in fields(method)}
+    return Reconstruction(volume, settings | {"iterations": iterations}, tuple(history))
 
 
 def _emission(problem: ReconProblem) -> Emission:

@@ -15,6 +15,7 @@ import pytest
 
 from beamline.instrument.connect import connect
 from beamline.storage.rules.nexus import nexus_findings
+from beamline.storage.writers.ending import ScanEnding, ending_in
 from drivers.base.protocols import TriggerTrain
 from tests.beamline import ran
 from tests.beamline.ball_scan import small
@@ -155,3 +156,28 @@ def test_a_lost_frame_fails_the_plan_and_leaves_the_shutter_closed(engine: Any, 
     assert not instrument.is_open and heard.of("stop")[0]["exit_status"] == "fail"
     with h5py.File(_file(tmp_path)) as file:
         assert (file["entry/progress/status"].asstr()[()], len(file["entry/frame_log/kind"])) == ("failed", 2)
+        ending = ending_in(file)
+    assert ending.missing == (2, 3, 4) and ending.reason.startswith("2 of 5 frames were taken: ")
+
+
+def test_a_plan_that_ends_before_its_frames_leaves_a_stopped_scan(engine: Any, tmp_path: Path) -> None:
+    from bluesky import plan_stubs, preprocessors
+    from ophyd_async.core import DetectorTrigger, TriggerInfo
+
+    from beamline.bluesky.camera import CameraDetector
+
+    camera = CameraDetector(ran.small(), FakeInstrument().connected(), tmp_path)
+
+    @preprocessors.stage_decorator([camera])
+    @preprocessors.run_decorator()
+    def plan() -> Generator[Any, Any, None]:
+        by_cable = TriggerInfo(number_of_events=N, trigger=DetectorTrigger.EXTERNAL_EDGE, livetime=0.01, deadtime=0.05)
+        yield from plan_stubs.prepare(camera, by_cable, wait=True)
+        yield from plan_stubs.declare_stream(camera, name="primary", collect=True)
+        yield from plan_stubs.kickoff(camera, wait=True)  # and no pulse comes
+
+    engine(plan())
+    with h5py.File(_file(tmp_path)) as file:
+        assert ending_in(file) == ScanEnding(
+            "stopped", tuple(range(N)), "0 of 5 frames were taken, as the plan ended before."
+        )

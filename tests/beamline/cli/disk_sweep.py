@@ -23,10 +23,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from beamline.study import run as study_run
-from beamline.tradeoff import run as tradeoff_run
-from beamline.tradeoff.data import write_array
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import runner
+from beamline.trials.data import write_array
+from beamline.trials.trial import Outcome, Trial
 
 _FAULTS = {
     "none": (0, 0, 0, 0),
@@ -40,8 +39,8 @@ _MODULES = {
     "archive": "cli.files",
     "recon": "cli.recon reconstruct.offline reconstruct.recon_report report.figures",
     "segment": "cli.segment",
-    "tradeoff": "cli.tradeoff tradeoff.run",
-    "study": "cli.study study.run study.figures",
+    "tradeoff": "cli.tradeoff trials.tradeoff",
+    "study": "cli.study trials.study trials.figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 
@@ -105,9 +104,8 @@ def main() -> None:
     cli = import_module("beamline.cli.main")
     for module in _MODULES[command[0]].split():  # once, before the forks
         import_module(f"beamline.{module}")
-    for module in (tradeoff_run, study_run):
-        module.run_trial = _made_up
-        module.compile_kernels = lambda *_: None
+    runner.run_trial = _made_up
+    runner.compile_kernels = lambda *_: None
     os.chdir(folder)
     out, counted, writes = Path("out"), Path("count"), 0
 

@@ -10,10 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.corrections.air import Air
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -48,9 +48,9 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return bent_and_straight(SCENE, tmp_path_factory.mktemp("air"))
 
 
-def _prepared(path: Path, model: str = "auto", spill: Spill | None = None) -> PreparedProjections:
+def _prepared(path: Path, model: str = "auto", buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
-        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, spill)
+        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer)
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
@@ -86,8 +86,8 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
 
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"])
-    spill = Spill(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
-    parts = _prepared(scans["bent"], spill=spill)
+    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    parts = _prepared(scans["bent"], buffer=buffer)
     np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
     assert parts.done["background"].said == whole.done["background"].said
 

@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from beamline.cli.main import main
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.calibrate import Calibrate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.test_air import bent_and_straight
@@ -44,10 +44,10 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return bent_and_straight(SCENE, tmp_path_factory.mktemp("terms"))
 
 
-def _prepared(path: Path, *terms: str, spill: Spill | None = None) -> PreparedProjections:
+def _prepared(path: Path, *terms: str, buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
         selection = Selection(axis_col=55.5, binning=2, steps=(Calibrate(terms),))
-        return prepare_projections(source, selection, lambda said: None, spill)
+        return prepare_projections(source, selection, lambda said: None, buffer)
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, NDArray[np.float32]]:
@@ -98,8 +98,8 @@ def test_a_straight_beam_stays_as_it_is_and_says_so(scans: dict[str, Path]) -> N
 @pytest.mark.slow
 def test_slabs_lose_the_same_background_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"], "background")
-    spill = Spill(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
-    parts = _prepared(scans["bent"], "background", spill=spill)
+    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    parts = _prepared(scans["bent"], "background", buffer=buffer)
     assert whole.measured is not None
     np.testing.assert_allclose(
         parts.projections.data[:, whole.measured], whole.projections.data[:, whole.measured], atol=2e-6
@@ -112,7 +112,7 @@ def test_views_held_out_lose_the_surface_of_their_time(scans: dict[str, Path]) -
         plain = Selection(axis_col=55.5, binning=2, views="fixed:40")
         found, before = (
             prepare_projections(source, selection, lambda said: None)
-            for selection in (plain.having(Calibrate(("background",))), plain)
+            for selection in (plain.with_steps(Calibrate(("background",))), plain)
         )
     assert found.held_out is not None and before.held_out is not None
     taken = before.held_out[0] - found.held_out[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
@@ -22,15 +23,23 @@ from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange, 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current directory, with a good scan in it, as NXtomo and as Data Exchange."""
-    monkeypatch.chdir(tmp_path)
-    write_exchange(tmp_path / "exchange.h5", SCAN)
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written")
+    write_exchange(folder / "exchange.h5", SCAN)
     info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, energy_kev=25.0)
-    with NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=SystemClock()) as writer:
+    with NXtomoWriter(folder / "scan.h5", info, SCAN.shape, clock=SystemClock()) as writer:
         for frame in frames_of(SCAN):
             writer.append(frame, digest(frame.counts))
+    return folder
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with a good scan in it, as NXtomo and as Data Exchange."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("exchange.h5", "scan.h5"):
+        shutil.copyfile(written / name, tmp_path / name)
     return tmp_path
 
 

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from tests.beamline.projections.test_poses import (
+from tests.beamline.projections.corrections.test_poses import (
     AXES,
     AXIS,
     COLUMNS,

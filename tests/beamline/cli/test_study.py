@@ -14,10 +14,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.study import run as study_run
-from beamline.study.figures import SliceSheet
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.report.slice_sheet import SliceSheet
+from beamline.trials import runner
+from beamline.trials.data import Data
+from beamline.trials.launch import DATA
+from beamline.trials.trial import Outcome, Trial
+from beamline.trials.worker import measured
 from recon.base.volume import Grid
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -35,16 +37,19 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, Data]]:
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
     found: list[tuple[Trial, Data]] = []
 
-    def trial(trial: Trial, work: Path, seed: int, *, keep: Path) -> Outcome:
-        data = Data.load(work / "data.npz")
-        truth = SCAN.truth(Grid.matching(data.geometry))
-        np.save(keep, truth + np.float32(ERROR) if found else truth)
-        found.append((trial, data))
+    def trial(trial: Trial, work: Path, seed: int, limit: float | None, *, keep: Path) -> Outcome:
+        data = Data.load(work / DATA)
+        grid = Grid.matching(data.geometry)
+        truth = SCAN.truth(grid)
+        figures, _ = measured(lambda key: truth + np.float32(ERROR) if found else truth, data, grid, keep)
+        assert trial.choice is not None
+        lines, geometry, _ = data.chosen(trial.choice)
+        found.append((trial, replace(data, projections=lines, geometry=geometry)))
         reached = "" if trial.seconds_asked is None else "7 iterations"
-        return Outcome(trial, "done", 2.0, 10**8, cpu_seconds=1.0, reached=reached)
+        return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0, reached=reached)
 
-    monkeypatch.setattr(study_run, "run_trial", trial)
-    monkeypatch.setattr(study_run, "compile_kernels", lambda *_: None)
+    monkeypatch.setattr(runner, "run_trial", trial)
+    monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)
     return found
 
 
@@ -131,14 +136,14 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
     folder: Path, seen: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_exchange(folder / "many.h5", SCAN)
-    trial = study_run.run_trial
+    trial = runner.run_trial
 
     def interrupted(*arguments: Any, **named: Any) -> Outcome:
         if len(seen) == 3:
             signal.raise_signal(signal.SIGINT)
         return trial(*arguments, **named)
 
-    monkeypatch.setattr(study_run, "run_trial", interrupted)
+    monkeypatch.setattr(runner, "run_trial", interrupted)
     result = _beamline("random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")
     assert result.exit_code == 4, result.output
     assert "stopped after 2 of 6 rows" in result.stderr and "interrupted" in result.stdout
@@ -162,7 +167,7 @@ def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
 
 def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(folder / "many.h5", SCAN)
-    monkeypatch.setattr(study_run, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     result = _beamline("random", "many.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 130, result.output
     assert not (folder / "out").exists()

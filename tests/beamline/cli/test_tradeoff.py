@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.tradeoff import run as tradeoff
-from beamline.tradeoff.trials import Outcome, Trial
+from beamline.trials import runner
+from beamline.trials.trial import Outcome, Trial
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
@@ -22,7 +22,7 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
 
 @pytest.fixture(autouse=True)
 def _nothing_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tradeoff, "compile_kernels", lambda *_: None)
+    monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)
 
 
 @pytest.fixture
@@ -44,7 +44,7 @@ def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
         seen.append(trial)
         return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))})
 
-    monkeypatch.setattr(tradeoff, "run_trial", trial)
+    monkeypatch.setattr(runner, "run_trial", trial)
     return seen
 
 
@@ -84,14 +84,14 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else 
 def test_ctrl_c_is_exit_code_4_with_a_table(
     folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial], number: signal.Signals
 ) -> None:
-    trial = tradeoff.run_trial
+    trial = runner.run_trial
 
     def interrupted(*arguments: Any, **named: Any) -> Outcome:
         if len(quick_trials) == 2:
             signal.raise_signal(number)
         return trial(*arguments, **named)
 
-    monkeypatch.setattr(tradeoff, "run_trial", interrupted)
+    monkeypatch.setattr(runner, "run_trial", interrupted)
     result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 4, result.output
     assert "after 2 of" in result.stderr
@@ -103,7 +103,7 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
 def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    monkeypatch.setattr(tradeoff, "run_trial", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(number))
     result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 130, result.output
     assert result.stderr.endswith("beamline: interrupted\n") and result.stdout == ""

@@ -14,7 +14,7 @@ from beamline.core.process import ChildProcess, Ending, with_our_path
 from beamline.reconstruct.batch import COMMAND
 from beamline.scan.run_folder import CONFIG
 from beamline.scan.watchdog import watched
-from beamline.tradeoff.launch import command as trial
+from beamline.trials.launch import command as trial
 
 OURS = ("beamline", "drivers", "recon", "simulators")
 TAKEN = {*sys.stdlib_module_names} - {*sys.builtin_module_names} | {*OURS, "numpy", "h5py", "serial", "yaml"}

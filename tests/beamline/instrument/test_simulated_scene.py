@@ -13,9 +13,9 @@ from beamline.core.errors import ConfigError, DataError, ScanStopped
 from beamline.core.events import BlockStarted, Event
 from beamline.core.sinks import Announcer
 from beamline.core.stop import StopRequest
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.scan import run as module
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan

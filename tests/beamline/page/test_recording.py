@@ -1,7 +1,9 @@
 """What the page reads of a scan file is what stands in it, also while it grows."""
 
+import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from beamline.monitor.digest import digest
 from beamline.page.recording import Recording
 from beamline.page.tiles import TileRegion
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
@@ -49,6 +52,19 @@ def test_a_region_s_trace_is_its_mean_in_each_frame(tmp_path: Path) -> None:
     trace = recording.trace(TileRegion(0, 4, 8, 16), first=3)
     recording.close()
     np.testing.assert_allclose(trace, [frame.counts[:, 8:16].mean() for frame in frames[3:]], rtol=1e-5)
+
+
+def test_numbers_that_json_has_not_are_none(tmp_path: Path) -> None:
+    path = write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
+    with h5py.File(path, "r+") as file:
+        file[layout.TIME][-1], file[layout.AXIS_COL] = np.inf, np.nan
+        file["/entry/digest/preview"][5] = np.nan
+    recording = Recording(path)
+    answers = recording.facts(), recording.columns(0), recording.trace(WHOLE, 5)
+    newest = recording.progress().newest
+    recording.close()
+    json.dumps(answers, allow_nan=False)
+    assert (answers[0]["axis_col"], answers[1]["time"][-1], answers[2][0], newest) == (None, None, None, None)
 
 
 def test_flags_have_score_level_and_region(tmp_path: Path) -> None:

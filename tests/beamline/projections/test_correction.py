@@ -11,10 +11,10 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.references import Flats
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flats import Flats
 from recon.prep.correct import Correction, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
@@ -151,14 +151,14 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
     none = Selection(steps=(Air("none"),))
     with pytest.raises(ConfigError, match="array has no ring current"):
-        ScanCorrection(source, none.having(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
     source.currents = current
     off = []
-    for selection in (none, none.having(Flats(ring_current="use"))):
+    for selection in (none, none.with_steps(Flats(ring_current="use"))):
         correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
     assert correction.done["flats"].said == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="no ring current for some views or flats"):
-        ScanCorrection(source, none.having(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
@@ -35,12 +35,12 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
 
 
 def prepare(
-    path: Path, *steps: PrepStep, spill: Spill | None = None, **chosen: Any
+    path: Path, *steps: PrepStep, buffer: DiskBuffer | None = None, **chosen: Any
 ) -> tuple[PreparedProjections, list[str]]:
     told: list[str] = []
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"), *steps), **chosen)
     with open_scan(path) as source:
-        return prepare_projections(source, selection, told.append, spill), told
+        return prepare_projections(source, selection, told.append, buffer), told
 
 
 def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
@@ -48,14 +48,14 @@ def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rows", [None, (1, 4)], ids=["whole frames", "most of their rows"])
-@pytest.mark.parametrize("spilled", [False, True])
-def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, spilled: bool) -> None:
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, on_disk: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
-    spill = Spill(np.empty((45, height, 40), np.float32), 7, lambda n, of: None) if spilled else None
-    prepared, told = prepare(path, spill=spill, rows=rows)
+    buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7, lambda n, of: None) if on_disk else None
+    prepared, told = prepare(path, buffer=buffer, rows=rows)
     np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
     said = " ".join(told)
-    assert ("Frames 9 " in said and "Frames 20-21 " in said) if spilled else "Frames 9, 20-21 " in said
+    assert ("Frames 9 " in said and "Frames 20-21 " in said) if on_disk else "Frames 9, 20-21 " in said
     assert "left out" in said
 
 

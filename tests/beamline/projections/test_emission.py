@@ -16,18 +16,16 @@ from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
-from beamline.study.run import Rig
-from beamline.study.studies import StudyRow
-from beamline.tradeoff.compared import split
-from beamline.tradeoff.data import Data
-from beamline.tradeoff.opened import ComparedScan
-from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
-from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.worker import run
+from beamline.trials.data import Data
+from beamline.trials.runner import ComparedScan
+from beamline.trials.tradeoff import TradeoffOptions, run_tradeoff, split
+from beamline.trials.trial import Trial
+from beamline.trials.view_choices import ViewChoice
+from beamline.trials.worker import run
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared
 from simulators.scenes.emission import events, load_emission
@@ -77,7 +75,7 @@ def test_recon_reads_it_and_gives_what_the_function_gives(pet: Path, tmp_path: P
         counted = source.emission(np.arange(24), slice(0, 3))
         geometry = recon.Geometry.parallel(source.angles, (3, 32), pixel_pitch=2.0)
     expected = recon.mlem(recon.Emission(counted.counts, geometry, counted.survival, counted.background),
-                          recon.Grid.matching(geometry), 3, 10)  # fmt: skip
+                          recon.Grid.matching(geometry), 3, 4)  # fmt: skip
     with h5py.File(out) as file:
         np.testing.assert_array_equal(file["entry/data/data"][()], expected.data)
         assert file["entry/data/data"].attrs["units"] == "counts/mm"
@@ -131,9 +129,9 @@ def test_sets_of_another_shape_and_a_wrong_scene_are_refused(pet: Path, tmp_path
 
 
 def test_counts_are_not_spilled(pet: Path) -> None:
-    spill = Spill(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
+    buffer = DiskBuffer(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
     with open_scan(pet) as source, pytest.raises(DataError, match="have to be in memory"):
-        prepare_projections(source, Selection(), print, spill)
+        prepare_projections(source, Selection(), print, buffer)
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -196,12 +194,12 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     groups = np.arange(24).reshape(12, 2)
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
-    np.save(tmp_path / "views.npy", prepared.projections.data)
-    rig = Rig(tmp_path, prepared.geometry, 0, {}, prepared.emission)
-    found, outcome = rig.reconstructed(StudyRow("pairs", groups), "osem", {"iterations": 2, "subsets": 3})
-    assert found is not None, outcome.message
+    data = Data(prepared.projections.data, prepared.geometry, None, None, None, prepared.emission)
+    settings: dict[str, int] = {"iterations": 2, "subsets": 3}
+    row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups))
+    run(row, data, 0, print, keep=tmp_path / "volume.npy")
     expected = recon.mlem(prepared.emission.summed(groups, views), recon.Grid.matching(views), 2, 3).data
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), expected)
 
 
 def test_a_set_that_changed_on_the_disk_is_refused_by_name(pet: Path, tmp_path: Path) -> None:

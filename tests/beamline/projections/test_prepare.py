@@ -12,14 +12,14 @@ import pytest
 import recon
 from beamline.core.errors import DataError
 from beamline.projections import axis as axis_module
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.tilt import spread_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse
+from recon.base.views import spread_views
 from recon.prep.align import AxisError, AxisEstimate
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange

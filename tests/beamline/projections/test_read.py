@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamline.projections.read import read_binned, read_references
+from beamline.projections.corrections.references import read_references
+from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import ReferenceGroups, groups_of
 from drivers.base.frame import FrameKind

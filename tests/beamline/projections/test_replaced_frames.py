@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.selection import Selection
-from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.rules.references import reference_groups
 from drivers.base.frame import FrameKind
 from tests.beamline.projections.replaced import AXIS, BEAM, VIEWS, Blocks, decibels, line_integrals

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,7 +15,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
-from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay
+from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay, verdict
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -49,6 +51,33 @@ def test_a_foreign_file_is_judged(tmp_path: Path) -> None:
         assert source.flags is None
         found = judged_flags(source)
     assert np.flatnonzero(found.alarmed).tolist() == [24]  # two darks and two flats come before the views
+
+
+@pytest.mark.parametrize(("dtype", "value"), [("i8", 2**60), ("f8", -1e300), ("f8", math.inf)])
+@pytest.mark.parametrize("rows", ["dark", "flat", "view", "half a view", "an angle", "all darks", "all"])
+def test_pixels_and_angles_that_are_no_measurement_are_named_and_nothing_else_fails(
+    dtype: str, value: float, rows: str
+) -> None:
+    views = SCAN.counts().astype(dtype)
+    data = np.concatenate([np.full((2, *SCAN.shape), DARK), np.full((2, *SCAN.shape), BEAM), views]).astype(dtype)
+    data += np.arange(8)[:, None].astype(dtype)
+    angles = np.r_[np.zeros(4), SCAN.angles]
+    own = {"dark": 1, "flat": 3, "view": 20, "all darks": slice(2), "all": slice(None)}
+    if rows == "an angle":
+        angles[20] = value
+    elif rows == "half a view":
+        data[20, :4] = value
+    else:
+        data[own[rows]] = value
+    source = ArraySource(data, [2, 2, 1, 1] + [0] * 30, angles)
+    judged = list(replay(source))  # type: ignore[arg-type]
+    found = verdict(source, judged)  # type: ignore[arg-type]
+    flags = [flag for each in judged for flag in each.flags]
+    assert all(math.isfinite(flag.score) for flag in flags)
+    said = [*(flag.advice for flag in flags), *found.references, found.drift]
+    assert not [each for each in said if re.search(r"\bnan\b|\binf\b", each)]  # NaN and infinite are words of ours
+    blank = [flag.frame for flag in flags if flag.check == "pixels" and flag.level is Level.ALARM]
+    assert blank == ([] if rows in ("an angle", "half a view") else np.arange(34)[own[rows]].reshape(-1).tolist())
 
 
 def test_line_integrals_are_judged_as_counts_of_a_beam() -> None:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import ConfigError, DataError
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.volume import Volume
 

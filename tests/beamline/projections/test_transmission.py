@@ -11,9 +11,9 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import validate
 from tests.beamline.scans import TwoCylinders

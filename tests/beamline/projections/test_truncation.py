@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.projections.truncation import cut_sides
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp
@@ -44,7 +44,7 @@ def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: fl
 
 
 def test_columns_that_are_said_to_be_air_are_air() -> None:
-    found = prepare_projections(scan(90.0), SELECTION.having(Air("columns")), lambda _: None)  # type: ignore[arg-type]
+    found = prepare_projections(scan(90.0), SELECTION.with_steps(Air("columns")), lambda _: None)  # type: ignore[arg-type]
     assert min(found.projections.air_columns) > 0
 
 

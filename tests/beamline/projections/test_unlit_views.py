@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, decibels_of, line_integrals
@@ -56,7 +56,7 @@ def test_few_of_them_cost_little(unlit: list[int]) -> None:
 
 def test_a_gap_is_told_and_flags_that_are_ignored_change_nothing() -> None:
     told: list[str] = []
-    selection = SELECTION.having(Flags("ignore"))
+    selection = SELECTION.with_steps(Flags("ignore"))
     prepare_projections(scan(list(range(10, 18)), None), selection, told.append)  # type: ignore[arg-type]
     (line,) = (line for line in told if "no light" in line)
     assert "8 views of 45 (frames 16-23) have no light" in line and "leave 36° without a view" in line
@@ -71,12 +71,12 @@ def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     unlit, frames = [3, 30, 31], FIRST + np.arange(VIEWS)
     source = scan(unlit, 0.0)
     at_once = ScanCorrection(source, SELECTION, lambda _: None).at_once(frames)  # type: ignore[arg-type]
-    spilt = Spill(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    spilt = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
     told: list[str] = []
     in_slabs = prepare_projections(source, SELECTION, told.append, spilt)  # type: ignore[arg-type]
     np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)
     assert len([line for line in told if "3 views of 45 (frames 9, 36-37) have no light" in line]) == 1
-    fed = ScanCorrection(source, SELECTION.having(Air("none")), told.append)  # type: ignore[arg-type]
+    fed = ScanCorrection(source, SELECTION.with_steps(Air("none")), told.append)  # type: ignore[arg-type]
     parts = [fed.feed(part, last=part[-1] == frames[-1]) for part in np.array_split(frames, 5)]
     ids = np.concatenate([part.view_ids for part in parts if part is not None])
     np.testing.assert_array_equal(ids, at_once.view_ids)

@@ -10,10 +10,10 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.base import read_known
 from beamline.storage.readers.open import SourceOptions
@@ -87,7 +87,7 @@ def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     scan: SourceOptions = write(tmp_path, spoilt)  # type: ignore[operator]
     told: list[str] = []
     with scan.open() as source:
-        prepared = prepare_projections(source, SELECTION.having(Flags(flags)), told.append)
+        prepared = prepare_projections(source, SELECTION.with_steps(Flags(flags)), told.append)
     views = np.setdiff1d(np.arange(6, len(FRAMES)), spoilt)
     assert prepared.projections.view_ids.tolist() == views.tolist()
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)

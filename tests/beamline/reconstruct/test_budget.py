@@ -54,10 +54,11 @@ class Ticking:
         return self.time
 
 
-@pytest.fixture
-def prepared(tmp_path: Path) -> PreparedProjections:
-    write_exchange(tmp_path / "scan.h5", SCAN)
-    with SourceOptions(tmp_path / "scan.h5").open() as source:
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
+    path = tmp_path_factory.mktemp("prepared") / "scan.h5"
+    write_exchange(path, SCAN)
+    with SourceOptions(path).open() as source:
         return prepare_projections(source, Selection(views="fixed:24", axis_col=SCAN.axis_col), lambda said: None)
 
 

@@ -30,10 +30,11 @@ SETTINGS = FitSettings()
 OTHER = next(kernel for kernel in Kernel if kernel is not SETTINGS.kernel)
 
 
-@pytest.fixture
-def prepared(tmp_path: Path) -> PreparedProjections:
-    write_exchange(tmp_path / "scan.h5", SCAN)
-    with SourceOptions(tmp_path / "scan.h5").open() as source:
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
+    path = tmp_path_factory.mktemp("prepared") / "scan.h5"
+    write_exchange(path, SCAN)
+    with SourceOptions(path).open() as source:
         return prepare_projections(source, Selection(axis_col=SCAN.axis_col), lambda said: None)
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.projections.flags import UsableViews
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
+from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct.follow import follow
 from beamline.reconstruct.live_fit import ScanFollower

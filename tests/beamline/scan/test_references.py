@@ -13,10 +13,10 @@ from beamline.core.errors import ConfigError, ReferencesError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from beamline.scan.references import ReferenceLog
 from beamline.scan.run import run_scan
 from beamline.scan.states import State

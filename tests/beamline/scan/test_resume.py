@@ -18,12 +18,12 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.files import parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
-from beamline.projections.flags import checked_views
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.prepare import prepare_projections
+from beamline.projections.refusals import checked_views
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.references import ReferenceCheck
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run

@@ -237,6 +237,20 @@ def stale(killed_while_joined: Path, tmp_path: Path) -> Path:
     return shutil.copytree(killed_while_joined, tmp_path / "run") / JOINED
 
 
+@pytest.fixture(scope="module")
+def recovered_once(killed_while_joined: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = shutil.copytree(killed_while_joined, tmp_path_factory.mktemp("recovered") / "run")
+    recover_run(run)
+    _assert_whole(run / JOINED)
+    return run
+
+
+@pytest.fixture
+def recovered(recovered_once: Path, tmp_path: Path) -> Path:
+    """The joined file of all three parts."""
+    return shutil.copytree(recovered_once, tmp_path / "run") / JOINED
+
+
 def _beamline(*words: str | Path) -> tuple[int, str]:
     said = CliRunner().invoke(main, [str(word) for word in words])
     return said.exit_code, said.output
@@ -318,32 +332,29 @@ def _without_its_parts(run: Path) -> None:
     ],
 )
 def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
-    stale: Path, change: Callable[[Path], None], said: str
+    recovered: Path, change: Callable[[Path], None], said: str
 ) -> None:
-    recover_run(stale.parent)
-    _assert_whole(stale)
-    change(stale.parent)
+    change(recovered.parent)
     with pytest.raises(DataError, match=said.replace("/", r"[/\\]")):
-        open_scan(stale)
-    recover_run(stale.parent)
-    with open_scan(stale) as source:
-        assert source.image_key.size == _frames(stale.parent)
+        open_scan(recovered)
+    recover_run(recovered.parent)
+    with open_scan(recovered) as source:
+        assert source.image_key.size == _frames(recovered.parent)
 
 
-def test_a_run_is_copied_as_a_whole_and_an_archive_needs_no_part(stale: Path, tmp_path: Path) -> None:
-    recover_run(stale.parent)
-    shutil.copytree(stale.parent, tmp_path / "copy")
+def test_a_run_is_copied_as_a_whole_and_an_archive_needs_no_part(recovered: Path, tmp_path: Path) -> None:
+    shutil.copytree(recovered.parent, tmp_path / "copy")
     _assert_whole(tmp_path / "copy" / JOINED)
     (tmp_path / "alone").mkdir()
-    shutil.copy(stale, tmp_path / "alone")
+    shutil.copy(recovered, tmp_path / "alone")
     with pytest.raises(DataError, match="copy the folder of the run as a whole"):
         open_scan(tmp_path / "alone" / JOINED)
-    archive(stale, tmp_path / "archive.h5")
-    shutil.copy(tmp_path / "archive.h5", stale.parent / "archive.h5")
+    archive(recovered, tmp_path / "archive.h5")
+    shutil.copy(tmp_path / "archive.h5", recovered.parent / "archive.h5")
     shutil.copy(tmp_path / "archive.h5", tmp_path / "alone" / JOINED)
-    with open_scan(stale) as source:
+    with open_scan(recovered) as source:
         n = source.image_key.size
-        for copy in (tmp_path / "archive.h5", stale.parent / "archive.h5", tmp_path / "alone" / JOINED):
+        for copy in (tmp_path / "archive.h5", recovered.parent / "archive.h5", tmp_path / "alone" / JOINED):
             with open_scan(copy) as archived:
                 np.testing.assert_array_equal(archived.read(slice(None)), source.read(slice(None)))
     assert _beamline("recover", tmp_path / "alone" / JOINED) == (
@@ -352,11 +363,10 @@ def test_a_run_is_copied_as_a_whole_and_an_archive_needs_no_part(stale: Path, tm
     )
 
 
-def test_while_a_later_part_grows_the_joined_file_is_refused(stale: Path) -> None:
+def test_while_a_later_part_grows_the_joined_file_is_refused(recovered: Path) -> None:
     """It has the frames of the parts before, and the scan goes on."""
-    recover_run(stale.parent)
-    shutil.copytree(stale.parent / "part-3", stale.parent / "part-4")
-    with h5py.File(stale.parent / "part-4" / "scan.h5", "r+") as file:
+    shutil.copytree(recovered.parent / "part-3", recovered.parent / "part-4")
+    with h5py.File(recovered.parent / "part-4" / "scan.h5", "r+") as file:
         file[layout.FINISHED][()] = 0
     with pytest.raises(DataError, match=r"lacks those of .*part-4"):
-        open_scan(stale)
+        open_scan(recovered)

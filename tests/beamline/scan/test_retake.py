@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.config.load import load
 from beamline.core.stop import ScanStopped, StopRequest
-from beamline.projections.flags import usable_views
+from beamline.projections.corrections.flags import usable_views
 from beamline.projections.replay import judged_flags
 from beamline.scan.run import run_scan
 from beamline.storage.describe import describe

@@ -11,7 +11,7 @@ import pytest
 from beamline.config.load import config_folder, load
 from beamline.core.events import Event
 from beamline.core.stop import ScanStopped, StopRequest
-from beamline.projections.flags import usable_views
+from beamline.projections.corrections.flags import usable_views
 from beamline.projections.returned import returned_views
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.core.events import Event
+from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
 from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.simulate.truth import binning_of, truth_of
 from beamline.simulate.write import write_scan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tracemalloc
 from collections.abc import Callable
@@ -212,6 +213,20 @@ def test_what_a_disk_does_not_give_back_is_found(
     with pytest.raises(DataError, match=f"does not give back what was written: {said} differs"):
         archive(scan, tmp_path / "small.h5")
     assert left(tmp_path) == {"scan.h5"}
+
+
+def test_a_file_system_may_number_files_anew(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os.path, "samestat", lambda one, other: False)
+    assert archive(scan, tmp_path / "small.h5").path.exists()
+
+    def another_is_put_there(one: os.stat_result, other: os.stat_result) -> bool:
+        with h5py.File(tmp_path / "other.h5", "r+") as file:
+            _pixel(file)
+        return False
+
+    monkeypatch.setattr(os.path, "samestat", another_is_put_there)
+    with pytest.raises(DataError, match="is not the file that was written and compared"):
+        archive(scan, tmp_path / "other.h5")
 
 
 def test_what_is_there_is_not_overwritten(scan: Path, tmp_path: Path) -> None:

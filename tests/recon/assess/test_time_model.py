@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES
 from recon.assess.time_model import duration_text, next_decibel, next_decibel_of_fit, parse_budget
+from recon.base.choices import DEFAULT_STEPS
 from recon.bench import spheres
 from recon.reconstruction import reconstruct
 from recon.splatting.r2 import R2
-from recon.splatting.schedule import DEFAULT_STEPS
 
 
 @given(st.floats(0.6, 8), st.floats(0.5, 1e4), st.integers(0, 100))

@@ -16,7 +16,7 @@ MIDDLE = np.array([0.013, -0.007, 0.309])
 TURN = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
 
 
-def shares(inside: object, grid: Grid = GRID, fine: int = 6) -> NDArray[np.float32]:
+def shares(inside: object, grid: Grid = GRID, fine: int = 4) -> NDArray[np.float32]:
     """Share of each voxel that lies inside, by `fine`³ points."""
     finer = Grid(tuple(n * fine for n in grid.shape), grid.voxel_size / fine, grid.centre)
     z, y, x = finer.coordinates()

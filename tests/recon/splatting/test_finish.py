@@ -14,20 +14,18 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Progress, ReconProblem, RunControl
+from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import finish
+from recon.splatting.finish import best_candidate, finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out_weight import Preferred
 from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.ordered_fista import Subsets, ordered_fista
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (8, 40))
@@ -67,58 +65,6 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).volume.data) for sweeps in (1, 3, 9)]
     assert all(later > before + 1 for before, later in pairwise(qualities))
     assert qualities[-1] > 30
-
-
-@pytest.mark.parametrize(("sweeps", "preferred", "made"), [(2, 16, 2), (None, 8, 16), (None, 24, 24)])
-def test_more_sweeps_or_a_second_run_are_made_where_no_number_is_given(
-    sweeps: int | None, preferred: int, made: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 1.0)
-    monkeypatch.setattr("recon.splatting.finish.preferred_sweeps", lambda *_, **__: preferred)
-    monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: 3.0)
-    looks, g = Mock(return_value=False), _blob()
-    data = project(g, VIEWS).numpy()
-    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)  # so that one attempt is enough
-    found = finish(_of(g), g, _problem(data), sweeps, control=RunControl(looks))
-    assert looks.call_count == found.sweeps == made
-
-
-def test_a_stop_during_the_trials_of_a_weight_keeps_the_fit() -> None:
-    g, told = _blob(), list[Progress]()
-    data = project(g, VIEWS).numpy()
-    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)
-    fitted = _of(g)
-    found = finish(fitted, g, _problem(data), control=RunControl(lambda: len(told) >= 3, told.append))
-    assert found.sweeps == 0
-    np.testing.assert_array_equal(found.volume.data, fitted.data)
-    assert [(p.step, p.steps, p.unit) for p in told] == [(n, 0, "sweeps of trials") for n in (1, 2, 3)]
-
-
-def test_a_second_attempt_takes_half_the_weight_that_views_held_out_prefer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first one leaves what voxels cannot explain; both are sweeps of this number."""
-    g, weights = _blob(8.0), []
-
-    def run(problem: VoxelProblem, x: F32, weight: float, *subsets: Subsets, **numbers: int) -> F32:
-        weights.append(weight)
-        return ordered_fista(problem, x, weight, *subsets, **numbers)
-
-    monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda *_: Preferred(0.25, 1.0))
-    monkeypatch.setattr("recon.splatting.finish.ordered_fista", run)
-    decide, data = Decisions(), project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
-    finish(_of(g), g, _problem(data), 3, control=RunControl(decide=decide))
-    assert weights == [0.25, 0.125]
-    assert decide.made["weight"] == [[0.25], [0.125]]  # which other slabs and error bars follow
-
-
-def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
-    g, missing = _blob(8.0), _box()
-    data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(missing)  # no noise: voxels explain all but that
-    told, looks = list[Progress](), iter([False, True])  # after the third sweep, then between
-    stop = RunControl(lambda: bool(told) and told[-1].step == told[-1].steps and next(looks), told.append)
-    once = finish(_of(g), g, _problem(data), 3, control=stop).volume
-    assert next(looks, None) is None
-    truth = _of(g).data + missing
-    assert psnr(truth, once.data) > psnr(truth, _of(g).data) + 3
 
 
 def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
@@ -182,7 +128,7 @@ def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generato
     grid = Grid.matching(views)
     truth = (0.02 * (1 + rng.integers(0, 3, (3, 8, 8)))).astype(np.float32).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     data = Projector(views, grid).forward(truth) + rng.normal(0, 0.01, (40, 12, 32)).astype(np.float32)
-    fitted, found = (reconstruct(data, views, R2(steps=150, gaussians=600, finish=n)).volume.data for n in (0, None))
+    fitted, found = (reconstruct(data, views, fit).volume.data for fit in (R2(finish=0), R2()))
     assert psnr(truth, found) > psnr(truth, fitted) + 3
 
 
@@ -227,13 +173,42 @@ def test_what_cannot_be_is_refused() -> None:
         build(Fbp, {"finish": 2})
 
 
-@pytest.mark.parametrize(("lacks", "sweeps"), [(False, 8), (True, 16)])
-def test_a_cone_whose_fit_lacks_structure_gets_twice_the_sweeps(lacks: bool, sweeps: int) -> None:
-    """Pixels are finer than voxels, so that edges within voxels stay with the Gaussians."""
-    views = Geometry.cone(np.linspace(0, 2 * math.pi, 30, endpoint=False), (48, 96), 0.5, 60.0, 84.0)
-    grid, fine = Grid((12, 24, 24), 1.0), Grid((24, 48, 48), 0.5)
-    at = np.random.default_rng(1).uniform(-5, 5, (60, 3)) * (0.6, 1, 1)
-    g = Gaussians.from_physical(at, np.full((60, 3), 0.3), np.full(60, 2.0), density_unit=2.0)
-    data = project(g, views).numpy() + (Projector(views, fine).forward(_box(fine)) if lacks else 0)
-    data += np.random.default_rng(0).normal(0, 0.05, data.shape).astype(np.float32)
-    assert finish(_of(g, grid), g, ReconProblem(data, views, grid, DataUse(), 0, "cpu")).sweeps == sweeps
+@pytest.mark.parametrize("at", [0, 1, 2])
+def test_the_volume_is_that_of_the_best_candidate(at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On voxels with the prior of the trial, after a short fit that gives the model."""
+    data = Projector(VIEWS, GRID).forward(_box())
+    prior = {"weight": [[1e-3]], "strength": [[1e-3, 1.0]]}
+    monkeypatch.setattr("recon.splatting.train.best_candidate", lambda *_: (at, prior))
+    found = R2(gaussians=50).run(_problem(data), RunControl())
+    assert found.settings["volume_by"] == ("fista-tv", "pnp-dct", "r2")[at]
+    assert found.settings["steps"] == (50, 50, 400)[at] and found.gaussians is not None
+    if at < 2:
+        decide = Decisions(0, prior)
+        alone = (FistaTv(), PnpDct())[at].run(_problem(data), RunControl(decide=decide)).volume.data
+        np.testing.assert_array_equal(found.volume.data, alone)
+
+
+def test_another_slab_makes_no_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, first = Projector(VIEWS, GRID).forward(_box()), Decisions()
+    monkeypatch.setattr("recon.splatting.train.best_candidate", lambda *_: (0, {"weight": [[1e-3]]}))
+    one = R2(gaussians=50).run(_problem(data), RunControl(decide=first)).volume.data
+    monkeypatch.setattr("recon.splatting.train.best_candidate", Mock(side_effect=AssertionError))
+    other = R2(gaussians=50).run(_problem(data), RunControl(decide=Decisions(0, first.made))).volume.data
+    np.testing.assert_array_equal(one, other)
+
+
+def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(rng: np.random.Generator) -> None:
+    """A chequered box, sharp to the voxel; and a smooth blob between coarse voxels of a cone is left to them."""
+    data = Projector(VIEWS, GRID).forward(_box()) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
+    fit = Mock(side_effect=lambda part, _: R2(steps=5, gaussians=50, finish=0).run(part, RunControl()))
+    at, prior = best_candidate(_problem(data), R2().fit, RunControl(), fit)
+    assert at < 2 and set(prior) == {"units", "weight", "strength"}
+    assert fit.call_args[0][0].geometry.n_views == 26  # views held out are not fitted
+    none = best_candidate(replace(_problem(data[:12]), geometry=VIEWS.select(range(12))), R2().fit, RunControl(), fit)
+    assert none == (2, {}) and fit.call_count == 1
+
+
+def test_a_stop_ends_the_trials() -> None:
+    data, looks = Projector(VIEWS, GRID).forward(_box()), iter([False, False])
+    stop = RunControl(lambda: next(looks, True))
+    assert best_candidate(_problem(data), R2().fit, stop, Mock()) == (2, {})

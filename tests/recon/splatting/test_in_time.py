@@ -45,9 +45,9 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 39.0, 40.0, 69.0, 349.0, 350.0, 1e3)]
     none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
     assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
-    # As many as views held out prefer, where time is left for 24, for as many of a trial and for three trials of 16.
-    found = [finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (744.0, 745.0)]
-    assert found == [(8, 350.0, True), (None, 745.0, True)]
+    # With patches, where time is left for their 35 steps, for the trials of total variation and for those of patches.
+    found = [finish_within(2e3, spare, views, grid, Ticking(1.0)) for spare in (1207.0, 1208.0)]
+    assert found == [(8, 350.0, True), (None, 1207.5, True)]
 
 
 @pytest.mark.slow

@@ -10,8 +10,9 @@ from scipy.optimize import minimize
 
 import recon
 from recon.base.geometry import Geometry
+from recon.base.method import Method
 from recon.base.volume import Grid, Volume
-from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
+from recon.voxels.emission import Emission, attenuation_factors, mlem, passes_by_halves, weighted_lines
 from recon.voxels.projector import Projector
 
 F32 = np.float32
@@ -35,6 +36,7 @@ def toy(seed: int = 0) -> tuple[Emission, Grid, np.ndarray]:
     )
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_maximum_is_that_of_a_general_optimiser() -> None:
     """L-BFGS-B with bounds on a dense matrix, in float64."""
     emission, grid, a = toy()
@@ -110,6 +112,48 @@ def test_subsets_reach_in_one_iteration_what_takes_as_many_without() -> None:
     plain, ordered = (mlem(Emission(counts, geometry), activity.grid, n, m).data / 1000 for n, m in ((20, 1), (2, 10)))
     assert np.sqrt(np.mean((plain - ordered) ** 2)) < 0.05
     assert np.sqrt(np.mean((ordered - activity.data) ** 2)) < 0.35
+
+
+@pytest.mark.parametrize(("total", "expected"), [(1e5, (2, 5)), (1e6, (6, 15))])
+def test_counts_held_out_end_the_iterations_where_the_volume_is_nearest_to_the_truth(
+    total: float, expected: tuple[int, int]
+) -> None:
+    """More counts take more of them. Half as many and twice as many are no nearer, and FBP is farther away."""
+    activity, mu, geometry = phantom()
+    survival = attenuation_factors(mu, geometry)
+    lines = survival * Projector(geometry, activity.grid).forward(activity.data)
+    scale = total / float(lines.sum())
+    background = np.full_like(lines, 0.25 * scale * lines.mean())
+    counts = np.random.default_rng(0).poisson(scale * lines + background).astype(F32)
+    emission = Emission(counts, geometry, survival, background)
+
+    def error(volume: Volume) -> float:
+        return float(np.sqrt(np.mean((volume.data / scale - activity.data) ** 2)))
+
+    chosen = recon.reconstruct(emission, geometry, recon.Osem())
+    n = chosen.settings["iterations"]
+    assert expected[0] <= n <= expected[1]
+    others = (mlem(emission, activity.grid, max(1, k), 4) for k in (n // 2, 2 * n))
+    assert error(chosen.volume) <= 1.02 * min(map(error, others))
+    assert error(chosen.volume) < 0.9 * error(recon.reconstruct(emission, geometry, "fbp").volume)
+
+
+def test_counts_that_are_none_of_poissons_choose_nothing_and_a_stop_ends_the_search() -> None:
+    emission, grid, _ = toy()
+    rng = np.random.default_rng(0)
+    scaled = replace(emission, counts=emission.counts * F32(0.7))
+    assert passes_by_halves(scaled, grid, 4, 60, rng) is None
+    assert passes_by_halves(emission, grid, 4, 60, rng, go_on=lambda done: False) == 1
+
+
+@pytest.mark.parametrize(("method", "passes"), [(recon.Mlem(), 200), (recon.Osem(), 50)])
+def test_where_counts_choose_nothing_there_are_200_updates(method: Method, passes: int) -> None:
+    emission, grid, _ = toy()
+    planned: list[int] = []
+    control = recon.RunControl(on_progress=lambda at: planned.append(at.steps), should_stop=lambda: True)
+    scaled = replace(emission, counts=emission.counts * F32(0.7))
+    made = recon.reconstruct(scaled, scaled.geometry, method, grid=grid, control=control)
+    assert planned == [passes] == [made.settings["iterations"]]
 
 
 def test_weighted_squares_have_the_gradient_and_the_curvature_of_the_likelihood() -> None:

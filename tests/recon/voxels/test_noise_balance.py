@@ -95,13 +95,6 @@ def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(rng: np.random.Ge
     assert sirt > fista - 1
 
 
-def test_what_no_volume_explains_is_counted_once() -> None:
-    balance = NoiseBalance(first=2.0, noise=1.0, counted=True)
-    for _ in range(4):
-        balance.after_sweep(_residual(2.0))
-    assert balance.value == 2.0
-
-
 def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
     balance = NoiseBalance(first=2.0, noise=1.0)
     balance.after_sweep(np.zeros((2, 3, 3), np.float32))

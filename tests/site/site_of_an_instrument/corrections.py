@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)

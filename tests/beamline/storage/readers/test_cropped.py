@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import CroppedSource
@@ -73,7 +73,7 @@ def test_rows_are_read_as_late_as_in_the_whole_scan() -> None:
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])
 def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int, right: int) -> None:
-    from beamline.projections.flags import regions_of
+    from beamline.projections.corrections.flags import regions_of
 
     source: Any = CroppedSource(_Flagged(), cols)  # type: ignore[arg-type]
     assert source.axis_col == 52.5 - cols[0]

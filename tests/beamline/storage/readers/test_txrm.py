@@ -13,10 +13,10 @@ import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.projections.corrections.poses import PosesOfFile
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.steps.poses import PosesOfFile
-from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
 from beamline.storage.pose_table import read_poses

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.projections.flags import usable_views
+from beamline.projections.corrections.flags import usable_views
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan

@@ -1,0 +1,256 @@
+"""What `beamline recon` can be asked for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.method_options import method_options, preset_option
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, heading
+from beamline.cli.options import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    json_option,
+    option,
+    parsed,
+    scan_argument,
+    together,
+    volume_path,
+)
+from beamline.cli.recipe import config_option
+from beamline.cli.recon_time import time_options
+from beamline.cli.selection_options import selection_options
+from beamline.storage.volumes.registry import suffixes_text
+from recon.base.choices import AUTO
+from recon.methods import names
+
+if TYPE_CHECKING:
+    from beamline.reconstruct.region import Region
+
+SHEET = ".png"
+"""Suffix of the picture of --axis try."""
+
+
+def output_path(text: str) -> Path:
+    """The path of a volume, or of the picture of --axis try. ValueError for another suffix."""
+    return Path(text) if Path(text).suffix.lower() == SHEET else volume_path(text)
+
+
+def memory_size(text: str) -> int:
+    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units). ValueError for anything else."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
+    if match is None or not float(match[1]) > 0:
+        raise ValueError(f"{text!r} is no size; expected a number and K, M, G or T, such as 8G")
+    return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
+
+
+def cluster_of(text: str) -> str:
+    """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
+    from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
+
+    check_cluster(text)
+    return text
+
+
+def region_of(text: str) -> Region:
+    """A box of voxels, `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
+    from beamline.reconstruct.region import Region  # here: help needs none of it
+
+    return Region.parse(text)
+
+
+_RUNNING = ("follow", "is for a scan that still runs: give --follow.")
+_IN_MEMORY = dict.fromkeys(("follow", "budget"), "it holds everything in memory")
+_PICTURE = {"axis_trials": "that writes a picture of slices, and nothing else"}
+
+recon_options = together(
+    heading(DATA),
+    config_option,
+    scan_argument,
+    heading(METHOD),
+    option(
+        "-m",
+        "--method",
+        type=click.Choice((AUTO, *names())),
+        help="auto chooses r2, fista-tv or fbp by how well it predicts views held out. r2 fits Gaussians to the views, "
+        "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
+        "options of the fit.",
+    ),
+    selection_options,
+    method_options,
+    preset_option,
+    time_options,
+    heading(METHOD),
+    option(
+        "--filter",
+        type=click.Choice(["ram-lak", "shepp-logan", "hann"]),
+        default="hann",
+        show_default=True,
+        help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
+    ),
+    heading(OUTPUT),
+    option(
+        "--max-residual",
+        type=NOT_NEGATIVE,
+        metavar="X",
+        help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
+    ),
+    heading(METHOD),
+    option("--seed", in_time=True, type=SEED, default=0, show_default=True, help="Seed of all random numbers."),
+    heading(OUTPUT),
+    option(
+        "--uncertainty",
+        excludes=dict.fromkeys(
+            ("follow", "budget", "seconds", "axis_trials"), "refits need the whole scan, and time of their own"
+        ),
+        is_flag=True,
+        help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv "
+        "and fbp, into an .h5.",
+    ),
+    option(
+        "--truth",
+        of_one_call=True,
+        metavar="FILE[:A:B]",
+        help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use.",
+    ),
+    option(
+        "-o",
+        "--output",
+        in_time=True,
+        of_one_call=True,
+        metavar="PATH",
+        callback=parsed(output_path),
+        help=f"Output: {suffixes_text()}; of --axis try a .png. "
+        "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
+    ),
+    option(
+        "--report/--no-report",
+        in_time=True,
+        of_one_call=True,
+        default=True,
+        show_default=True,
+        help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
+    ),
+    heading(DATA),
+    option(
+        "--follow",
+        excludes={"slabs": "these slabs are of a finished scan", "axis_trials": "they need all views"},
+        of_one_call=True,
+        is_flag=True,
+        help="Follow a running scan: reconstruct while its file grows.",
+    ),
+    option(
+        "--earlier",
+        needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts."),
+        of_one_call=True,
+        type=click.Path(path_type=Path),
+        multiple=True,
+        metavar="FILE",
+        help="With --follow, of a run that goes on: an earlier part of it, whose views come first. May be repeated.",
+    ),
+    option(
+        "--enough-loss",
+        needs=_RUNNING,
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: say when the views to come would add at most so many dB of PSNR.",
+    ),
+    option(
+        "--enough-gain",
+        needs=_RUNNING,
+        type=POSITIVE,
+        metavar="DB",
+        help="With --follow: say when ten more views would add at most so many.",
+    ),
+    option(
+        "--unfinished",
+        in_time=True,
+        of_one_call=True,
+        is_flag=True,
+        help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
+    ),
+    heading(RESOURCES),
+    option(
+        "--memory",
+        excludes=_IN_MEMORY,
+        in_time=True,
+        metavar="SIZE",
+        callback=parsed(memory_size),
+        help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
+        "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
+    ),
+    option(
+        "--cluster",
+        excludes=_IN_MEMORY,
+        of_one_call=True,
+        metavar="local:N|tcp://HOST:PORT|slurm[:CONFIG]",
+        callback=parsed(cluster_of),
+        help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
+        "those of a scheduler, or jobs of Slurm by a YAML file.",
+    ),
+    heading(OUTPUT),
+    option(
+        "--roi",
+        "region",
+        excludes={
+            "follow": "it is for a finished scan",
+            "truth": "a truth is compared with the whole volume",
+            "axis_trials": "they draw whole slices",
+        },
+        metavar="Z0:Z1,Y0:Y1,X0:X1",
+        callback=parsed(region_of),
+        help="Box of voxels to write, of the volume that the same options give without this one. It is made of the "
+        "rows that show it; fbp makes these voxels alone.",
+    ),
+    option(
+        "--write-config",
+        of_one_call=True,
+        repeated=False,
+        type=click.Path(path_type=Path),
+        help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
+        "done.",
+    ),
+    option(
+        "--log",
+        excludes=_PICTURE,
+        of_one_call=True,
+        repeated=False,
+        type=click.Path(path_type=Path),
+        help="Write everything that happens to this text file.",
+    ),
+    option(
+        "-v",
+        "--verbose",
+        of_one_call=True,
+        repeated=False,
+        is_flag=True,
+        help="Print everything that happens, with its time, to stderr.",
+    ),
+    heading(RESOURCES),
+    option(
+        "--dry-run",
+        "dry",
+        excludes={"follow": "a scan that runs takes its own time", "budget": "it says the time itself", **_PICTURE},
+        in_time=True,
+        of_one_call=True,
+        repeated=False,
+        is_flag=True,
+        help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
+    ),
+    option(
+        "--beside-scan",
+        "beside",
+        of_one_call=True,
+        repeated=False,
+        is_flag=True,
+        hidden=True,
+        help="Ends with its scan; its output is the run's.",
+    ),
+    heading(OUTPUT),
+    json_option,
+)
+"""All options of `beamline recon`, and its argument."""

@@ -1,0 +1,263 @@
+"""Air: a view's air is scaled by its edge columns; its background is fitted on all rays that miss the sample."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.projections.step import StepDone, StepMemory, option
+from recon.base.binning import bin_views, factor_within
+from recon.base.views import spread
+from recon.base.volume import Grid
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from beamline.projections.prepared import PreparedProjections
+    from beamline.projections.protocols import ScanPart
+    from recon.base.arrays import F32, F64, Mask
+    from recon.base.geometry import Geometry
+    from recon.prep.background import AirSums, Background
+
+_VOXELS, _VIEWS = 2**20, 180  # at most, of the volume that tells where the sample is
+_RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
+_COPIES = 6  # float32 copies of the volume
+_TERMS, _SUMS = 40, 800  # float64 numbers a binned pixel, and a view
+_AT_ONCE, _NOISE_VIEWS = 64, 16  # views
+_LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
+
+Columns = Literal["none", "auto"] | tuple[int, int]
+Surface = Literal["auto", "none"] | int
+"""The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
+
+_MODELS: dict[str, tuple[Columns, Surface]] = {
+    "auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none"),
+}  # fmt: skip
+
+
+def _parts(text: str) -> tuple[Columns, Surface]:
+    """Which columns at the detector's edges show air, and the surface that is taken off."""
+    if match := re.fullmatch(r"(\d+),(\d+)", text):
+        return (int(match[1]), int(match[2])), "none"
+    if match := re.fullmatch(r"surface:([0-3])", text):
+        return "auto", int(match[1])
+    if text not in _MODELS:
+        raise ValueError(
+            f"{text!r} is not known; expected auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12) or "
+            "surface:ORDER (0 to 3)"
+        )
+    return _MODELS[text]
+
+
+def _model(text: str) -> str:
+    _parts(text)
+    return text
+
+
+@dataclass(frozen=True)
+class Air:
+    """Takes a background off each view, so that its air is at zero.
+
+    Attributes:
+        model: as the option says it.
+    """
+
+    name: ClassVar[str] = "background"
+    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    needs_finished: ClassVar[str] = ""
+    model: str = option(
+        "--air",
+        "auto",
+        "Set the air of each view to zero. columns: subtract the line through the air at both edges. LEFT,RIGHT: the "
+        "same, with this many columns of air at each edge. surface:0 to surface:3: also subtract a polynomial of this "
+        "order, fitted to all rays that miss the sample. auto: the surface, if the views confirm it.",
+        parse=_model,
+        metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
+    )
+
+    @property
+    def columns(self) -> Columns:
+        """(left, right) columns of air, as of `recon.prep.correct.CorrectionSettings`, which takes them."""
+        return _parts(self.model)[0]
+
+    @property
+    def sample_from(self) -> float:
+        """Line integral at the edges from which they are sample, as for the monitor; columns asked for are air."""
+        from beamline.monitor.field import FieldOfViewCheck
+
+        return FieldOfViewCheck.edge if self.model == "auto" else math.inf
+
+    @property
+    def surface(self) -> Surface:
+        """The surface that is taken off, see `without_background`."""
+        return _parts(self.model)[1]
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory(alone=0 if self.surface == "none" else background_memory(part.geometry))
+
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
+        from recon.base.masks import areas
+
+        air = views.projections.air
+        levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
+        said, terms = without_background(
+            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked),
+            levelled,
+        )  # fmt: skip
+        line = any(views.projections.air_columns)
+        nothing = "no surface taken off, a line through the air at the edges" if line else "none taken off"
+        parameters: dict[str, Any] = {"surface": self.surface, "background": said or nothing}
+        return StepDone(said, parameters if terms is None else {**parameters, "background_terms": terms})
+
+
+def background_memory(geometry: Geometry) -> int:
+    """Most bytes that `without_background` takes beside such views, about."""
+    from recon.voxels.fbp import fbp_memory
+
+    small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
+    n, pixels, grid = geometry.n_views, math.prod(small.detector_shape), Grid.matching(small)
+    some = min(n, _VIEWS)
+    fit = 8 * (_TERMS * pixels + _SUMS * n)
+    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(some, grid.shape[2])
+    return fit + volume + 4 * (4 * some + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
+
+
+class _Views:
+    """Line integrals [view, row, col] with their geometry, which are taken binned and finite, so many at a time."""
+
+    def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
+        self.data, (rows, cols) = data, geometry.detector_shape
+        self.factor = factor_within((rows, cols), _VOXELS)
+        filled = np.zeros((1, rows, cols), np.float32) if unknown is None else unknown[None].astype(np.float32)
+        self._measured = bin_views(filled, self.factor)[0] == 0
+        self.geometry = geometry.binned(self.factor)
+
+    def binned(self, numbers: NDArray[np.int64]) -> F32:
+        from recon.base.masks import masked
+
+        return np.concatenate([bin_views(masked(self.data[k : k + 1])[0], self.factor) for k in numbers])
+
+    def sums(self, sample: Mask, grid: Grid, numbers: NDArray[np.int64]) -> AirSums:
+        """Sums over the rays of some views that miss the sample, which is a mask on a grid."""
+        from recon.prep.background import AirSums
+        from recon.voxels.projector import Projector
+
+        sums, volume = AirSums(self.data.shape[1:], self.factor), sample.astype(np.float32)
+        for part in np.array_split(numbers, max(1, numbers.size // _AT_ONCE)):
+            paths = Projector(self.geometry.select(part), grid).forward(volume)
+            for view, path in zip(self.binned(part), paths, strict=True):
+                sums.add(view, (path <= 0) & self._measured)
+        return sums
+
+
+def without_background(
+    data: F32,
+    geometry: Geometry,
+    wanted: Surface,
+    others: tuple[F32, Geometry] | None = None,
+    unknown: Mask | None = None,
+    levelled: float = 0.0,
+) -> tuple[str, F64 | None]:
+    """Take the background of the beam off views [view, row, col], in place.
+
+    Returns what was done, in words (empty: nothing), and the terms of the mean surface that was taken off.
+
+    Args:
+        wanted: "auto": where the views confirm it; a number: polynomials of this order.
+        others: further views and their geometry, which lose their background, too.
+        unknown: bool [row, col], pixels that were not measured.
+        levelled: line integral of the air at the edges that was taken off already, the mean of the views.
+
+    Raises:
+        DataError: polynomials were asked for, and too few rays miss the sample.
+    """
+    from beamline.projections.truncation import cut_sides
+    from recon.base.noise import noise_level
+
+    if wanted == "none":
+        return "", None
+    order = None if wanted == "auto" else wanted
+    views = _Views(data, geometry, unknown)
+    shows_air = _see_all_sides(geometry) and not cut_sides(
+        data, geometry
+    )  # a sample that fills the field looks like air
+    fitted, where = _fitted(views, order) if shows_air else (None, None)
+    if fitted is None or where is None:
+        if order is None:
+            return "", None
+        raise DataError(
+            "--air surface: too few rays miss the sample, so that no surface can be fitted. Give --air columns or none."
+        )
+    if order is None and not fitted.confirmed(noise_level(views.binned(spread(np.arange(len(data)), _NOISE_VIEWS)))):
+        return "", None
+    seen = _described(fitted, levelled)
+    # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
+    if order is None and fitted.may_be_matter and fitted.level + levelled > 0:
+        return (
+            f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: the "
+            f"surface is not taken off. If that is air, give --air surface:{fitted.order}."
+        ), None
+    if others is not None:
+        more = _Views(*others, unknown)
+        unseen = more.sums(*where, np.arange(len(more.data))).fit(fitted.order)
+        if unseen is not None:
+            unseen.remove(more.data)
+    fitted.remove(data)
+    said = (
+        f"Background of the beam: {seen}; taken off. Air was {fitted.before:.2g} off nothing and is {fitted.after:.2g}."
+    )
+    return said, fitted.coefficients.mean(axis=0)
+
+
+def _described(fitted: Background, levelled: float) -> str:
+    """The surface in words, and the line that was taken off before it."""
+    from recon.prep.background import LEAST_SIZE
+
+    before = ""
+    if abs(levelled) >= LEAST_SIZE:
+        before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
+    return (
+        f"{before}the air of the views is a surface from {fitted.lowest:+.3f} to {fitted.highest:+.3f} of line "
+        f"integral, by the {fitted.air:.0%} of the rays that miss the sample (order {fitted.order})"
+    )
+
+
+def _see_all_sides(geometry: Geometry) -> bool:
+    """Views enough, and no wide gap between them: else a first volume does not show where the sample is."""
+    angles = np.sort(np.mod(geometry.angles, geometry.period))
+    gaps = np.diff(angles, append=angles[0] + geometry.period)
+    return geometry.n_views >= _LEAST_VIEWS and bool(gaps.max() < _WIDEST_GAP)
+
+
+def _fitted(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
+    """The background of all views, by where a first volume of some of them has matter; and that."""
+    from recon.prep.background import matter
+    from recon.splatting.initialise import first_volume
+
+    n, geometry = len(views.data), views.geometry
+    numbers = spread(np.arange(n), _VIEWS)
+    some, grid = geometry.select(numbers), Grid.matching(geometry)
+    _, y, x = grid.coordinates()
+    away = np.hypot(y[:, None], x)
+    measured = views.binned(numbers)
+    fitted = None
+    for last, rim in enumerate(_RIMS):
+        levelled = measured.copy()
+        if fitted is not None:
+            fitted.remove(levelled, factor=views.factor)
+        inside = away <= geometry.reach - rim * grid.voxel_size
+        if not inside.any():  # a detector of a few columns
+            return None, (np.zeros(grid.shape, np.bool_), grid)
+        sample = matter(first_volume(levelled, some, grid).data, inside)
+        fitted = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
+        if fitted is None:
+            break
+    return fitted, (sample, grid)

@@ -1,0 +1,237 @@
+"""Poses of views from a file: displacement, roll and tilt, which become geometry. No view is resampled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.text import count
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.protocols import Unmoved
+from beamline.projections.selection import cone_of, pivot_of, pixel_size, with_pivot
+from beamline.projections.step import StepDone, StepMemory, option
+from drivers.base.frame import FrameKind
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from beamline.projections.protocols import ScanPart, ViewMotion
+    from beamline.projections.selection import Selection
+    from beamline.projections.usable_views import UsableViews
+    from beamline.storage.pose_table import PoseTable
+    from beamline.storage.readers.base import ScanSource
+    from recon.base.arrays import F64, I64
+    from recon.base.geometry import Geometry
+
+_OFF = 0.25  # of the step between two views: an angle that differs by more belongs to another view
+
+
+def _table(text: str) -> PoseTable:
+    from beamline.storage.pose_table import read_poses
+
+    return read_poses(text)
+
+
+@dataclass(frozen=True)
+class PosesOfFile:
+    """Where views were displaced, rolled and tilted, as a file states it.
+
+    Attributes:
+        table: the file's; None: views are displaced as the scan file says (.txrm), or not at all.
+    """
+
+    name: ClassVar[str] = "poses"
+    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    table: PoseTable | None = option(
+        "--poses",
+        None,
+        "Displacement, roll and tilt of each view; no view is resampled. FILE is a CSV with the columns view or "
+        "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an NXtomo file "
+        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. ignore: do not use the shifts that "
+        "a .txrm states.",
+        parse=_table,
+        metavar="FILE",
+    )
+
+    @property
+    def needs_finished(self) -> str:
+        return "" if self.table is None else "--poses is for a finished scan: it needs all views."
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()
+
+    def place(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        usable: UsableViews,
+        axis_col: float,
+        progress: Callable[[int, int], None],
+    ) -> ViewMotion:
+        return poses_of(source, selection, usable.frames) or Unmoved(usable.frames)
+
+
+def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
+    """The poses of the option's file, or else the shifts that the scan file states."""
+    from beamline.storage.pose_table import PoseTable
+
+    table, shifts = selection.step(PosesOfFile).table, source.shifts
+    if table is not None:
+        return table if table.keys.size else None
+    if shifts is None:
+        return None
+    rows = np.flatnonzero(np.isfinite(shifts).all(axis=1))
+    frames = rows.astype(np.float64)
+    return PoseTable(source.path, "frame", frames, None, shifts[rows], np.zeros((rows.size, 2)), frames=len(shifts))
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPoses:
+    """Poses of the frames of a scan.
+
+    Attributes:
+        shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN where the file states none.
+        roll, tilt: float64 [frame], radians.
+        frames: int64 [view], the rows that are used.
+        said: in a line, what was read.
+        pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
+        binning: of the detector's pixels.
+    """
+
+    shifts: F64
+    roll: F64
+    tilt: F64
+    frames: I64
+    said: str
+    pivot: float
+    binning: int
+
+    @property
+    def done(self) -> StepDone:
+        return StepDone(self.said)
+
+    def known(self, view_ids: I64) -> NDArray[np.bool_]:
+        """[view] whether the file states their pose."""
+        return np.isfinite(self.roll[view_ids])
+
+    def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
+        """The geometry of these rows of the file in their poses."""
+        posed = replace(
+            geometry,
+            shifts=geometry.shifts + self.shifts[view_ids] / self.binning,
+            roll=geometry.roll + self.roll[view_ids],
+            tilt=geometry.tilt + self.tilt[view_ids],
+        )
+        return with_pivot(posed, self.pivot)
+
+
+def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses | None:
+    """The poses that the selection's file states of `frames`, or the scan file itself; None without any.
+
+    Raises:
+        ConfigError: options that do not go together.
+        DataError: the file does not fit the scan: the message says how.
+    """
+    table = stated_poses(source, selection)
+    if table is None:
+        return None
+    tilt = selection.step(TiltAndLens)
+    if tilt.sought or tilt.tilt_deg:
+        raise ConfigError(
+            f"--tilt turns views that {table.path} states as they were taken: write it to the roll_deg of --poses."
+        )
+    if selection.step(Calibrate).geometry:
+        raise ConfigError(
+            f"--calibrate learns what {table.path} states: give one of --calibrate and --poses, or --poses ignore."
+        )
+    shifts = table.shifts * _pixels(table, source, selection)
+    rows = _rows(table, source, frames)
+    height, width = source.shape
+    if (far := (np.abs(shifts) >= (width, height)).any(axis=1)).any():
+        row = int(np.flatnonzero(far)[0])
+        raise DataError(
+            f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "
+            f"{shifts[row, 1]:g} rows on a detector of {width} x {height}; expected pixels of the unbinned detector."
+        )
+    n = source.image_key.size
+    every = np.full((n, 4), np.nan)
+    every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
+    pivot, said = pivot_of(source, selection), _said(table, shifts)
+    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, said, pivot, selection.binning)
+
+
+def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:
+    """Pixels of the unbinned detector in the table's unit."""
+    if table.unit == "px":
+        return 1.0
+    if cone_of(source, selection) is not None:
+        raise DataError(
+            f"{table.path}: translations of the sample in mm are no shifts of a cone's views, whose matter is "
+            "magnified by its depth. Give a CSV of shifts in pixels. Nothing was read."
+        )
+    size = pixel_size(source, selection)
+    if size is None:
+        raise DataError(f"{table.path} is in mm, and {source.path} does not say its pixel size: give --pixel-size-um.")
+    return 1 / size
+
+
+def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
+    """[frame of the scan] its row in the table; -1: none. Angles that both state must agree."""
+    n, views = source.image_key.size, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if table.frames is not None and table.frames != n:
+        raise DataError(f"{table.path} has {table.frames} frames, {source.path} has {n}; expected the same scan.")
+    found, degrees = np.full(n, -1, np.int64), np.degrees(source.angles)
+    distances = np.diff(np.unique(np.round(degrees[frames], 9)))
+    tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
+    if table.by == "angle_deg":
+        order = np.argsort(table.keys)
+        ordered = table.keys[order]
+        right = np.clip(np.searchsorted(ordered, degrees[views]), 0, ordered.size - 1)
+        left = np.maximum(right - 1, 0)
+        wanted = degrees[views]
+        nearest = np.where(np.abs(ordered[left] - wanted) < np.abs(ordered[right] - wanted), left, right)
+        close = np.abs(ordered[nearest] - wanted) <= tolerance
+        found[views[close]] = order[nearest[close]]
+    else:
+        into = views if table.by == "view" else np.arange(n)
+        if (beyond := table.keys >= into.size).any():
+            raise DataError(
+                f"{table.path} states {table.by} {table.keys[beyond][0]:g}; {source.path} has {into.size} {table.by}s, "
+                "counted from 0."
+            )
+        found[into[table.keys.astype(np.int64)]] = np.arange(table.keys.size)
+        if table.angles_deg is not None:
+            both = frames[found[frames] >= 0]
+            off = np.abs(table.angles_deg[found[both]] - degrees[both])
+            if (off > tolerance).any():
+                at = int(both[off > tolerance][0])
+                raise DataError(
+                    f"{table.path} states frame {at} at {table.angles_deg[found[at]]:.6g} degrees, {source.path} at "
+                    f"{degrees[at]:.6g}; expected the poses of the same scan."
+                )
+    return found
+
+
+def require_known(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
+    """DataError where views have no pose."""
+    unknown, table = view_ids[~poses.known(view_ids)], stated_poses(source, selection)
+    if unknown.size and table is not None:
+        degrees = np.degrees(source.angles[unknown[0]])
+        raise DataError(
+            f"{table.path} states no pose of {unknown.size} of the {view_ids.size} views chosen of {source.path} "
+            f"(the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add them, or choose the others with --views."
+        )
+
+
+def _said(table: PoseTable, shifts: F64) -> str:
+    across, down = np.ptp(shifts, axis=0)
+    roll, tilt = np.abs(table.turns_deg).max(axis=0)
+    return (
+        f"{count(table.keys.size, 'pose')} from {table.path}: shifts over {across:.3g} px (columns) and {down:.3g} px "
+        f"(rows), roll up to {roll:.3g}° and tilt up to {tilt:.3g}°."
+    )

@@ -1,0 +1,237 @@
+"""References: which darks and flats are used, and the open beam of each view that they give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, get_args
+
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.text import count
+from beamline.projections.corrections.counts import Defects
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.step import StepMemory, option
+from drivers.base.frame import FrameKind
+from recon.base.choices import FlatFields
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from beamline.core.sinks import Warn
+    from beamline.projections.protocols import ScanPart
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.references import ReferenceGroups
+    from recon.prep.correct import References
+
+
+@dataclass(frozen=True)
+class ReferenceCheck:
+    """How darks and flats are checked. `checked_views` and `OpenBeam` ask for it.
+
+    Attributes:
+        wanted: "accept": they are used as they are, also saturated, dark, uneven or lit ones.
+    """
+
+    name: ClassVar[str] = "references"
+    follows: ClassVar[tuple[str, ...]] = ("flags",)
+    needs_finished: ClassVar[str] = ""
+    wanted: str = option(
+        "--references",
+        "check",
+        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven or lit); refuse the scan if "
+        "no group remains. accept: use all as they are.",
+        choices=("check", "accept"),
+    )
+
+    @property
+    def accepted(self) -> bool:
+        return self.wanted == "accept"
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()
+
+
+@dataclass(frozen=True)
+class Flats:
+    """The open beam of each view. It must be known before counts become line integrals: `OpenBeam` asks for it.
+
+    Attributes:
+        fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components of
+            their changes that the view shows, see `recon.prep.dynamic_flats`.
+        ring_current: "use": views and flats are divided by the ring current that the file has for each frame.
+    """
+
+    name: ClassVar[str] = "flats"
+    follows: ClassVar[tuple[str, ...]] = ("references",)
+    needs_finished: ClassVar[str] = ""
+    fields: FlatFields = option(
+        "--flat-fields",
+        "groups",
+        "groups: interpolate the flat of each view between the means of the groups of flats. dynamic: for a beam that "
+        "moves, also add those variations of the flats that the view shows (needs 4 flats or more).",
+        choices=get_args(FlatFields),
+    )
+    ring_current: str = option(
+        "--ring-current",
+        "ignore",
+        "use: divide views and flats by the ring current of each frame in the file (control/data of NXtomo).",
+        choices=("ignore", "use"),
+    )
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        if self.fields != "dynamic":
+            return StepMemory()
+        from recon.prep.dynamic_flats import search_memory, view_memory
+
+        pixels, flats = part.view_bytes() // 4, int((part.source.image_key == FrameKind.FLAT).sum())
+        return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))
+
+
+def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> References:
+    """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
+
+    Frames that are damaged (see ScanSource) are left out, unless the selection uses all. The light of flats with an
+    exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat, where both are known. The
+    dark is one for all: the file's rules tell where it was exposed otherwise.
+
+    Raises:
+        DataError: all frames of a kind are damaged.
+    """
+    from beamline.projections.read import spoilt_frames
+    from recon.prep.correct import References
+
+    binning, use_damaged = selection.binning, not selection.step(Flags).used
+    dark = _mean(source, np.concatenate(groups.darks), rows, binning, None, use_damaged)
+    scale = light_scale(source, use_current(selection))
+    flats = []
+    for group in groups.flats:
+        mean = _mean(source, group, rows, binning, scale[group], use_damaged)
+        if dark is not None and mean is not None:
+            used = np.setdiff1d(group, spoilt_frames(source, use_damaged))
+            flats.append((float(used.mean()), (mean + (1 - scale[used].mean()) * dark).astype(np.float32)))
+    if dark is None or not flats:
+        raise DataError(
+            f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are not "
+            "what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
+        )
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
+
+
+def with_dynamic_flats(
+    source: ScanSource, groups: ReferenceGroups, references: References, rows: slice, selection: Selection
+) -> References:
+    """The same references with the components of all flats of these groups, which are read three times.
+
+    Raises:
+        ConfigError: there are too few flats.
+    """
+    from beamline.projections.read import read_binned, spoilt_frames
+    from recon.prep.defects import dead_pixels
+    from recon.prep.dynamic_flats import find_dynamic_flats
+
+    frames = np.concatenate(groups.flats)
+    frames = np.setdiff1d(frames, spoilt_frames(source, not selection.step(Flags).used))
+    scale = light_scale(source, use_current(selection))
+
+    def flats() -> Iterator[NDArray[np.float32]]:
+        for frame in frames:
+            image = read_binned(source, np.array([frame]), rows, selection.binning)[0]
+            yield ((image - references.dark) * np.float32(scale[frame])).astype(np.float32)
+
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.step(Defects).hot_threshold)
+    try:
+        dynamic = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
+    except ValueError as error:
+        raise ConfigError(f"--flat-fields dynamic: {source.path}: {error}. Leave it out.") from error
+    return replace(references, dynamic=dynamic)
+
+
+def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
+    """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
+
+    If projections differ, the median counts. With `by_current` also from its own ring current.
+    """
+    scale = _to_median(source.exposures, source.image_key)
+    return scale * current_scale(source) if by_current else scale
+
+
+def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:
+    """The median of the projections over each frame's own; 1 where one is unknown."""
+    views = values[image_key == FrameKind.PROJECTION]
+    views = views[np.isfinite(views)]
+    if views.size == 0:
+        return np.ones(values.size)
+    return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+
+
+def use_current(selection: Selection) -> bool:
+    """Views and flats are divided by the ring current."""
+    return selection.step(Flats).ring_current == "use"
+
+
+def current_scale(source: ScanSource) -> NDArray[np.float64]:
+    """By how much the light of each frame grows from its own ring current to the median of the projections'.
+
+    Raises:
+        ConfigError: the file has none for some view or flat.
+    """
+    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
+    currents = source.currents
+    if currents is None or not np.isfinite(currents[used]).all():
+        lacking = "no ring current" if currents is None else "no ring current for some views or flats"
+        raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
+    return _to_median(currents, source.image_key)
+
+
+def _mean(
+    source: ScanSource,
+    frames: NDArray[np.int64],
+    rows: slice,
+    binning: int,
+    weights: NDArray[np.float64] | None,
+    use_damaged: bool,
+) -> NDArray[np.float64] | None:
+    """Mean of the frames that may be used, each times its weight; float64 [row, col], binned; None where none may."""
+    from beamline.projections.read import read_binned, spoilt_frames
+
+    total, n = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64), 0
+    for i, frame in enumerate(frames):
+        image = read_binned(source, np.array([frame]), rows, binning)[0]
+        if int(frame) not in spoilt_frames(source, use_damaged):
+            total += image if weights is None else weights[i] * image
+            n += 1
+    return total / n if n else None
+
+
+def flats_said(source: ScanSource, references: References, current_factor: NDArray[np.float64] | None) -> str:
+    """What was done about changes of the beam, in words; empty where nothing was asked."""
+    said = []
+    if current_factor is not None:
+        currents = 1 / current_factor[source.image_key == FrameKind.PROJECTION]
+        said.append(
+            f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
+        )
+    if references.dynamic is not None:
+        n = len(references.dynamic.components)
+        said.append(
+            f"Flats: {count(n, 'component')} of their changes, weighed for each view (dynamic)."
+            if n
+            else "Flats: they do not differ by more than noise; their mean is used."
+        )
+    return " ".join(said)
+
+
+def warn_of_parts_without_flats(source: ScanSource, references: References, warn: Warn) -> None:
+    """A warning for each part of the scan whose views are corrected by the flats of another part."""
+    starts = source.part_starts
+    flats = [position for position, _ in references.flats]
+    for start, end in zip(starts, [*starts[1:], source.image_key.size], strict=True):
+        has_views = (source.image_key[start:end] == FrameKind.PROJECTION).any()
+        if has_views and not any(start <= position < end for position in flats):
+            warn(
+                f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used. The "
+                f"nearest flats of another part correct their views, though the beam may have changed."
+            )

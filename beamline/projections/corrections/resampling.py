@@ -1,0 +1,244 @@
+"""Resampling: the tilt of the axis and the distortion of the lens are taken out of the views, in one step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import text_in
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.protocols import ScanPart, ViewFilter
+from beamline.projections.selection import cone_of
+from beamline.projections.step import StepDone, StepMemory, option
+from drivers.base.frame import FrameKind
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from beamline.core.sinks import Warn
+    from beamline.projections.selection import Selection
+    from beamline.projections.tilt import BandsDone
+    from beamline.storage.readers.base import ScanSource
+    from recon.prep import resample
+    from recon.prep.correct import Projections
+
+_MOST_TILT_DEG = 45.0
+_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # by which the tilt is found
+_NOTHING = 0.05  # px over the rows, not worth new pixels
+_ROUNDS = 5
+_COPIES = 20  # float32 copies of all bands while their axes are found
+
+
+def _tilt(text: str) -> float | str:
+    """An angle within 45 degrees, or "auto"."""
+    if text == "auto":
+        return text
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= _MOST_TILT_DEG:
+        raise ValueError(f"{text!r} is neither auto nor degrees within {_MOST_TILT_DEG:g} of 0")
+    return number
+
+
+def _distortion(text: str) -> resample.Distortion:
+    """The distortion that a text file says."""
+    from recon.prep.resample import Distortion
+
+    try:
+        return Distortion.parse(text_in(Path(text)))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{text}: {error}") from error
+
+
+@dataclass(frozen=True)
+class TiltAndLens:
+    """How views are resampled.
+
+    Attributes:
+        tilt: degrees by which the axis leans in the detector's plane; its column grows by tan(tilt) a row. "auto": it
+            is found. None: it is unknown, and views are used as they are.
+        distortion: of the lens; None: none.
+    """
+
+    name: ClassVar[str] = "tilt"
+    follows: ClassVar[tuple[str, ...]] = ("noise",)
+    tilt: float | str | None = option(
+        "--tilt",
+        None,
+        "Lean of the rotation axis in the detector's plane, positive if its column grows with the rows; views are "
+        "turned by it. auto: find it by all rows. Default: use views as they are, with a warning if they show a tilt.",
+        parse=_tilt,
+        metavar="DEGREES|auto",
+    )
+    distortion: resample.Distortion | None = option(
+        "--distortion",
+        None,
+        "Correct the radial distortion of the lens by FILE, the text file that discorpy writes (backward model: "
+        "xcenter, ycenter, factor0 ...).",
+        parse=_distortion,
+        metavar="FILE",
+        path=True,
+    )
+
+    @property
+    def sought(self) -> bool:
+        """The tilt is to be found."""
+        return self.tilt == "auto"
+
+    @property
+    def tilt_deg(self) -> float:
+        """The turn of the views in degrees, as far as it is known."""
+        return self.tilt if isinstance(self.tilt, float | int) else 0.0
+
+    @property
+    def needs_finished(self) -> str:
+        said = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
+        return said if self.sought else ""
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from recon.prep.tilt import STEEPEST
+
+        known = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
+        if (found := known.of(part.source, part.selection)) is None:
+            return StepMemory()
+        copies = 17 if self.distortion is None else 26
+        search = _search_memory(part.source, part.selection) if self.sought else 0
+        return StepMemory(copies * part.view_bytes(found.reach), search)
+
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
+        found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."
+        if found is None:
+            return None, self.done("")
+
+        def apply(views: Projections, first: int) -> Projections:
+            found.apply(views.data, first)
+            return replace(views, masked=found.nearest(views.masked, first))
+
+        return ViewFilter(apply, found.reach, "--tilt and --distortion mix"), self.done(turned if self.tilt_deg else "")
+
+    def done(self, said: str) -> StepDone:
+        """What it did, with what is recorded where nothing was asked, too."""
+        lens = {} if self.distortion is None else asdict(self.distortion)
+        parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": said} if said else {})}
+        return StepDone(said, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
+
+    def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
+        """How views are resampled; None where they are used as they are.
+
+        Raises:
+            ConfigError: a cone's axis is to be levelled.
+        """
+        from recon.prep.resample import Resampling
+
+        if (self.tilt_deg or self.sought) and cone_of(source, selection) is not None:
+            raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
+        if not self.tilt_deg and self.distortion is None:
+            return None
+        lens = self.distortion
+        if lens is not None and source.cols is not None:
+            lens = replace(lens, col=lens.col - source.cols[0])
+        return Resampling(source.shape, math.radians(self.tilt_deg), lens, selection.binning)
+
+
+def _plain(value: Any) -> float | str:
+    return value if isinstance(value, float) else str(value)
+
+
+def with_tilt(
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
+) -> tuple[Selection, str]:
+    """The selection with its tilt found by all rows of the detector, if it asks for that; and a sentence about it.
+
+    The sentence is empty where the tilt was not asked for.
+
+    Args:
+        frames: views that may be used.
+        progress: takes how many bands of rows were corrected, and how many there are at most.
+
+    Raises:
+        ConfigError: a cone.
+        DataError: the views do not tell it.
+    """
+    from beamline.projections.tilt import MATTERS, tilt_text
+    from recon.base.views import spread_views
+    from recon.prep.tilt import STEEPEST
+
+    step = selection.step(TiltAndLens)
+    step.of(source, selection)  # refuses a cone
+    if not step.sought:
+        return selection, ""
+    rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
+    try:
+        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, progress)
+    except ValueError as error:
+        raise DataError(
+            f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
+        ) from error
+    if abs(tilt) > STEEPEST:
+        raise DataError(
+            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, more than the "
+            f"{math.degrees(STEEPEST):g} that are looked for. Look at the views; give the tilt with --tilt DEGREES."
+        )
+    said = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
+    if uncertainty * rows > MATTERS:
+        warn(f"{said}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
+    if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
+        return selection.with_steps(replace(step, tilt=0.0)), f"{said}: not corrected."
+    return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
+
+
+def _search_memory(source: ScanSource, selection: Selection) -> int:
+    """Bytes that `with_tilt` takes at most, if it is to find the tilt."""
+    from beamline.projections.correction import at_once_memory
+    from recon.prep.tilt import STEEPEST
+
+    step, frames = selection.step(TiltAndLens), int((source.image_key == FrameKind.PROJECTION).sum())
+    steepest = replace(_without_blur(selection), rows=None).with_steps(replace(step, tilt=math.degrees(STEEPEST)))
+    n, cols = min(frames, _VIEWS), source.shape[1] // selection.binning
+    rows = source.shape[0] // selection.binning
+    middle = max(0, rows // 2 - _BAND_ROWS)
+    band = at_once_memory(source, steepest, n, slice(middle, min(rows, middle + _BAND_ROWS)))
+    return 4 * n * _BANDS * cols + max(band, _COPIES * 4 * n * _BANDS * cols)
+
+
+def _refined(
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], progress: BandsDone
+) -> tuple[float, float]:
+    """The tilt by views that were levelled by the tilt of the last round, and its uncertainty; radians.
+
+    Raises:
+        ValueError: see `find_tilt`.
+    """
+    from beamline.projections.correction import ScanCorrection
+    from beamline.projections.tilt import shown_tilt
+
+    plain, step = _without_blur(selection), selection.step(TiltAndLens)
+    rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
+    tilt = 0.0
+    for n in range(_ROUNDS):
+        levelled = ScanCorrection(source, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None)
+        residual = shown_tilt(
+            source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
+        )
+        tilt += residual.tilt
+        if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:
+            break
+    return tilt, residual.uncertainty
+
+
+def _without_blur(selection: Selection) -> Selection:
+    """The selection without the corrections that blur the views."""
+    return selection.with_steps(Phase(), CountModel("log"))
+
+
+def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:
+    """Progress of a part of the work that begins at `offset`."""
+    return lambda n, _: progress(offset + n, total)

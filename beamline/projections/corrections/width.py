@@ -1,0 +1,186 @@
+"""Width: a pixel's spread on the detector, and what the stage turned during an exposure and its readout."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from beamline.core.errors import ConfigError
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.protocols import ScanPart
+from beamline.projections.step import StepDone, StepMemory, option
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+    from beamline.storage.writers.recon_file import Value
+    from recon.base.geometry import Geometry
+
+_MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
+_LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
+TO_MIDDLE = "middle_of_exposure_deg"
+"""Parameter of a volume: angle of a view less that in the file, where the arc is too short to be modelled."""
+
+
+class _Motion(NamedTuple):
+    """Radians that the stage turned: during an exposure, and from one row of the detector to the next; signed."""
+
+    arc: float
+    skew: float
+
+
+def _spread(text: str) -> str:
+    """none, pixel, or a blur in pixels. ValueError for anything else."""
+    if text not in ("none", "pixel"):
+        try:
+            blur = float(text)
+        except ValueError:
+            blur = math.nan
+        if not 0 < blur <= _MOST_PX:
+            raise ValueError(f"{text!r} is neither none, nor pixel, nor a blur up to {_MOST_PX:g} pixels, e.g. 0.7")
+    return text
+
+
+def _arc(text: str) -> str:
+    """auto, none, or degrees of the exposure, with those from the first row to the last. ValueError for others."""
+    if text not in ("auto", "none"):
+        try:
+            numbers = [float(part) for part in text.split(":")]
+        except ValueError:
+            numbers = []
+        if not (0 < len(numbers) <= 2 and all(abs(number) <= _MOST_DEG for number in numbers) and numbers[0] >= 0):
+            raise ValueError(
+                f"{text!r} is neither auto, nor none, nor ARC[:READOUT] of 0 to {_MOST_DEG:g} degrees, e.g. 0.5"
+            )
+    return text
+
+
+@dataclass(frozen=True)
+class Width:
+    """What a pixel saw beside its central ray.
+
+    Attributes:
+        spread: "none": rays. "pixel": a pixel's own area. A number: that, and a Gaussian blur of so many pixels.
+        arc: "auto": the motion that the file states, where it is a pixel or more. "none": the stage stood.
+            "ARC[:READOUT]": degrees during an exposure, and from the first row of the detector to its last.
+    """
+
+    name: ClassVar[str] = "width"
+    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    spread: str = option(
+        "--ray-width",
+        "none",
+        "What a pixel sees. none: one ray. pixel: its own area. SIGMA: its area with a Gaussian blur of SIGMA pixels.",
+        parse=_spread,
+        metavar="none|pixel|SIGMA",
+    )
+    arc: str = option(
+        "--exposure-arc",
+        "auto",
+        "Degrees that the stage turns: ARC during an exposure, READOUT from the readout of the first row to that of "
+        "the last (negative: the last row is read first). auto: from the file of a fly scan, if ARC is 1 px or more at "
+        "the edge of the field. none: the stage stands still.",
+        parse=_arc,
+        metavar="auto|none|ARC[:READOUT]",
+    )
+
+    @property
+    def needs_finished(self) -> str:
+        if self.spread == "none" and self.arc in ("auto", "none"):
+            return ""
+        return "--ray-width and --exposure-arc are for a finished scan"
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()
+
+    def rays(self, source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, StepDone]:
+        """The geometry with the rays' width; angles become those of the middle of the exposure.
+
+        Raises:
+            ConfigError: rows of a cone, or of views that roll or tilt or may do so, that see angles of their own.
+        """
+        from recon.base.ray_width import RayWidth
+
+        blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
+        width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
+        told, motion = self._motion(source), _Motion(0.0, 0.0)
+        parameters: dict[str, Value] = {}
+        reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
+        if told is not None:
+            leaning = not geometry.is_straight or selection.step(Calibrate).may_lean
+            bent = geometry.is_cone or leaning
+            if self.arc != "auto":
+                motion = told
+                if bent and told.skew:
+                    found = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
+                    raise ConfigError(
+                        f"--exposure-arc {self.arc}: rows with angles of their own are known of a straight parallel "
+                        f"beam only, and this is {found}. Give the arc alone. Nothing was written."
+                    )
+            elif abs(told.arc) * reach >= _LEAST_PX:
+                motion = _Motion(told.arc, 0.0 if bent else told.skew)
+            elif told.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
+                geometry = replace(geometry, angles=geometry.angles + told.arc / 2)
+                parameters[TO_MIDDLE] = math.degrees(told.arc / 2)
+        if not (width or any(motion)):
+            return geometry, StepDone(parameters=parameters)
+        first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
+        seen = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
+        seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
+        turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
+        said = [
+            *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
+            *([f"a view is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at the edge of the "
+               "field)"] if motion.arc else []),
+            *([f"the last row sees {turned[1]:.2g} degrees more than the first"] if motion.skew else []),
+        ]  # fmt: skip
+        parameters |= {
+            "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
+        }  # fmt: skip
+        return seen, StepDone(f"In the model of the views {', '.join(said)}.", parameters)
+
+    def _motion(self, source: ScanSource) -> _Motion | None:
+        """Asked for, or told by the file; None: the stage stood, or the file does not say."""
+        if self.arc == "none":
+            return None
+        if self.arc != "auto":
+            arc, skew = ([math.radians(float(part)) for part in self.arc.split(":")] + [0.0])[:2]
+            sense = -1.0 if _step(_of_views(source, source.angles)) < 0 else 1.0
+            return _Motion(sense * arc, sense * skew / max(source.shape[0] - 1, 1))
+        return stated_motion(source)
+
+
+def stated_motion(source: ScanSource) -> _Motion | None:
+    """The motion that the file of a fly scan states; None: the stage stood, or the file does not say.
+
+    The speed is that of the median step from view to view, so that passes and lost views do not count.
+    """
+    import numpy as np
+
+    plan, period = source.plan, source.attributes.get("period_s")
+    if not (plan.get("mode") == "fly" or plan.get("fly") is True) or not isinstance(period, float) or period <= 0:
+        return None
+    exposures = _of_views(source, source.exposures)
+    if not np.isfinite(exposures).any():
+        return None
+    speed = _step(_of_views(source, source.angles)) / period
+    return _Motion(speed * float(np.nanmedian(exposures)), speed * (source.row_period or 0.0))
+
+
+def _of_views(source: ScanSource, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    from drivers.base.frame import FrameKind
+
+    return values[source.image_key == FrameKind.PROJECTION]
+
+
+def _step(angles: NDArray[np.float64]) -> float:
+    """The median step from view to view in radians."""
+    import numpy as np
+
+    steps = np.diff(angles)
+    steps = steps[np.isfinite(steps)]
+    return float(np.median(steps)) if steps.size else 0.0

@@ -1,0 +1,56 @@
+"""Refusals: why a scan cannot be reconstructed or corrected, known before any frame is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from beamline.core.errors import DataError
+from beamline.core.sinks import Warn
+from beamline.projections.corrections.flags import Flags, usable_views
+from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.replay import judged_flags
+from beamline.projections.selection import Selection
+from beamline.projections.usable_views import UsableViews
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.flags import frames_flagged
+from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.validate import quantity_said, references_present, scan_ended, scan_findings
+
+
+def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+    """The views of a finished scan that may be used, by the flags of the monitor.
+
+    Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
+
+    Raises:
+        DataError: it cannot be reconstructed; with every reason, and what to do about each.
+    """
+    flags = selection.step(Flags)
+    judged = judged_flags(source) if flags.judged and source.finished else None
+    accepted = selection.step(ReferenceCheck).accepted
+    findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, accepted)]
+    if flags.used:
+        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
+    refuse(source, findings)
+    usable = usable_views(source, flags.used, judged)
+    if usable.said:
+        warn(usable.said)
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
+    return usable
+
+
+def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
+    """Raises DataError for the errors among the findings, with what to do about each."""
+    reasons = [finding.message for finding in findings if finding.severity == "error"]
+    if reasons:
+        raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
+
+
+def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
+    """Why the frames of a scan that is still growing cannot be corrected."""
+    checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
+    rules = (quantity_said, references_present, *checked)
+    return [finding for rule in rules for finding in rule(source)]

@@ -1,0 +1,99 @@
+"""The registry of steps: one line a step. A new correction takes its file and its line here; a plug-in none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from graphlib import TopologicalSorter
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from beamline.projections.protocols import PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
+from beamline.projections.step import StepDone, key_of, options_of
+from drivers.plugins import plugins
+
+if TYPE_CHECKING:
+    from beamline.projections.selection import Selection
+    from beamline.storage.writers.recon_file import Value
+
+REGISTRY: dict[str, str] = {
+    "TiltAndLens": "resampling",
+    "Air": "air",
+    "Flags": "flags",
+    "ReferenceCheck": "references",
+    "CountModel": "counts",
+    "Defects": "counts",
+    "Flats": "references",
+    "Phase": "phase",
+    "Jumps": "jumps",
+    "PosesOfFile": "poses",
+    "Width": "width",
+    "Calibrate": "calibrate",
+    "Rings": "rings",
+    "Hardening": "hardening",
+}
+"""Class, and its module in `corrections`; options stand in this order."""
+
+
+@cache
+def registered() -> tuple[type[PrepStep], ...]:
+    """Every step, in the order of the registry; those of other packages come last."""
+    ours: list[type[PrepStep]] = [
+        getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for cls, module in REGISTRY.items()
+    ]
+    names = {step.name for step in ours}
+    taken = {option.name for step in ours for option in options_of(step).values()}
+
+    def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
+        own = {option.name for option in options_of(step).values()}
+        if step.name != name or not isinstance(step(), ViewStep | PlaceStep | RayStep | ScanStep):
+            raise ValueError(
+                f"{step.__name__} is no ViewStep, PlaceStep, RayStep or ScanStep of the entry point's name"
+            )
+        if own & taken or not names.issuperset(step.follows):
+            raise ValueError(f"it has an option of another step ({own & taken}), or follows none of {sorted(names)}")
+        taken.update(own)
+        return step
+
+    return (*ours, *plugins("correction", names, fitting).values())
+
+
+@cache
+def all_steps() -> tuple[type[PrepStep], ...]:
+    """Every step, each after those that it follows."""
+    by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
+    order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
+    return tuple(by_name[name] for name in order)
+
+
+def in_order(selection: Selection) -> list[PrepStep]:
+    """Every step that there is as the selection has it, each after those that it follows."""
+    return [selection.step(kind) for kind in all_steps()]
+
+
+def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
+    """All steps with these values of their options, which are keyed as `key_of` says.
+
+    Raises:
+        ValueError: options of a step that do not go together.
+    """
+    return tuple(
+        step(**{field: values[key_of(option.name)] for field, option in options_of(step).items()})
+        for step in registered()
+    )
+
+
+def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
+    """What the file of a volume records of the steps, by name."""
+    found: dict[str, Value] = {}
+    for step in steps:
+        did = done.get(step.name, StepDone())
+        said = {f"{step.name}_said": did.said} if did.said else {}
+        found |= _options(step) | said if did.parameters is None else did.parameters
+    return found
+
+
+def _options(step: PrepStep) -> dict[str, Value]:
+    """The values of a step's options."""
+    values = {key_of(option.name): getattr(step, field) for field, option in options_of(type(step)).items()}
+    return {key: value if isinstance(value, int | float) else str(value) for key, value in values.items()}

@@ -1,0 +1,107 @@
+"""Values of a step, which is a correction of views: its options, its name, the memory it takes, and what it did.
+
+A step is a frozen dataclass. A field made by `option` is an option of the commands, of a recipe and of Python alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+
+if TYPE_CHECKING:
+    from beamline.storage.writers.recon_file import Value
+
+
+class NamedStep(Protocol):
+    """What a selection knows of a step; the protocols in `beamline.projections.protocols` say what it can do.
+
+    Attributes:
+        name: by which events and `PreparedProjections.done` know it.
+        follows: names of steps that come before it.
+    """
+
+    name: ClassVar[str]
+    follows: ClassVar[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a step on the command line.
+
+    Attributes:
+        name: with its dashes.
+        help: for people.
+        default: as it would be typed; None: there is nothing to type.
+        parse: what is typed to the value of the field; its ValueError is bad usage.
+        choices: what may be typed; empty: anything that `parse` takes.
+        metavar: what stands for the value in help.
+        path: it names a file.
+    """
+
+    name: str
+    help: str
+    default: str | None = None
+    parse: Callable[[str], Any] = str
+    choices: tuple[str, ...] = ()
+    metavar: str | None = None
+    path: bool = False
+
+
+def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
+    """A field of a step that the option `name` sets; `rest` is as of `Option`. Its default is that of the option."""
+    made = Option(name, help, default, **rest)
+    return field(default=None if default is None else made.parse(default), metadata={"option": made})
+
+
+def options_of(step: type[NamedStep]) -> dict[str, Option]:
+    """The options of a step, by field."""
+    return {each.name: each.metadata["option"] for each in fields(step) if "option" in each.metadata}  # type: ignore[arg-type]
+
+
+def key_of(option: str) -> str:
+    """The name of an option's value among those of a command."""
+    return option.lstrip("-").replace("-", "_")
+
+
+def positive(text: str) -> float:
+    """A finite number above 0. ValueError for anything else."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{text} is not in the range x>0")
+    return number
+
+
+@dataclass(frozen=True, eq=False)
+class StepDone:
+    """What a step did.
+
+    Attributes:
+        said: a sentence; empty where nothing was asked, or nothing found.
+        parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
+        warned: a warning told it.
+    """
+
+    said: str = ""
+    parameters: Mapping[str, Value] | None = None
+    warned: bool = False
+
+
+@dataclass(frozen=True)
+class StepMemory:
+    """Bytes that a step takes at most, beside raw pixels, line integrals and volume.
+
+    Attributes:
+        correcting: while views are corrected, a batch at a time.
+        alone: before or after that.
+    """
+
+    correcting: int = 0
+    alone: int = 0
+
+    @classmethod
+    def of_all(cls, steps: Iterable[StepMemory]) -> StepMemory:
+        """That of all steps, which act one after the other."""
+        needs = list(steps)
+        return cls(max(need.correcting for need in needs), max(need.alone for need in needs))

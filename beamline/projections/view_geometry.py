@@ -1,0 +1,107 @@
+"""Geometry of the views of a scan: as it is stated, and with what corrections find out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
+from beamline.projections.corrections.calibrate import Calibrate, Calibrated
+from beamline.projections.corrections.poses import poses_of
+from beamline.projections.protocols import PlaceStep, RayStep, ViewMotion
+from beamline.projections.registry import in_order
+from beamline.projections.selection import Selection, choose_views, geometry_of
+from beamline.projections.step import StepDone
+from beamline.projections.usable_views import UsableViews
+from beamline.storage.readers.base import ScanSource
+from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+
+
+def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
+    """The views that the selection names, as scan and options state them, before any frame is read.
+
+    An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+        DataError: the poses do not fit the scan.
+    """
+    frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    poses = poses_of(source, selection, frames)
+    if poses is not None:
+        frames = frames[poses.known(frames)]
+    frames = frames[choose_views(source, frames, selection)]
+    stated = source.axis_col if selection.axis_col is None else selection.axis_col
+    axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
+    geometry = geometry_of(source, selection, axis_col, source.angles[frames])
+    if poses is not None:
+        geometry = poses.corrected(geometry, frames)
+    for step in in_order(selection):
+        if isinstance(step, RayStep):
+            geometry, _ = step.rays(source, selection, geometry)
+    return geometry
+
+
+@dataclass(eq=False)
+class ViewGeometry:
+    """The geometry of views: the stated angles, and what steps find out and change.
+
+    Attributes:
+        stated_axis: the column of the rotation axis before calibration.
+        moved: where the sample was in the views, by the name of the step that found it.
+        rays: what the steps on rays did, by name.
+        learnt: by calibration; None: nothing.
+    """
+
+    source: ScanSource
+    selection: Selection
+    stated_axis: float
+    moved: dict[str, ViewMotion] = field(default_factory=dict)
+    rays: dict[str, StepDone] = field(default_factory=dict)
+    learnt: Calibrated | None = None
+
+    @property
+    def axis_col(self) -> float:
+        """The column of the rotation axis."""
+        return self.stated_axis if self.learnt is None else self.stated_axis + self.learnt.axis
+
+    @property
+    def done(self) -> dict[str, StepDone]:
+        """What the steps did, by their names."""
+        calibrated = {} if self.learnt is None else {self.selection.step(Calibrate).name: self.learnt.done}
+        return {**{name: motion.done for name, motion in self.moved.items()}, **self.rays, **calibrated}
+
+    def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
+        """Let each step find where the sample was; those of the `usable` views that can still be used."""
+        for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
+            motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
+            self.moved[step.name] = motion
+            if motion.said:
+                warn(motion.said)
+            usable = usable.only(motion.frames)
+        return usable
+
+    def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
+        """Learn the geometry from these views, where that is asked for."""
+        step = self.selection.step(Calibrate)
+        if step.geometry:
+            phases.enter("calibration", "steps")
+            self.learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+
+    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views, before calibration."""
+        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
+        for motion in self.moved.values():
+            geometry = motion.corrected(geometry, view_ids)
+        for step in (step for step in in_order(self.selection) if isinstance(step, RayStep)):
+            geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
+        return geometry
+
+    def of(self, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views."""
+        geometry = self.uncalibrated(self.selection, view_ids)
+        return geometry if self.learnt is None else self.learnt.corrected(geometry, view_ids)

@@ -1,1 +1,0 @@
-"""Studies of one scan: which views, how many and from where; each by a table of reconstructions of chosen views."""

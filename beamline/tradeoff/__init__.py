@@ -1,1 +1,0 @@
-"""Trade-off: many reconstructions of one scan, compared by quality, time and memory."""

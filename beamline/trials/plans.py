@@ -1,0 +1,245 @@
+"""Plans: which settings of each method a trade-off tries, in which order, and how long the rest will take.
+
+A method without a line in `TRIALS` is tried with its defaults.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Literal
+
+from beamline.trials.joint import MOTION
+from beamline.trials.trial import Outcome, Trial
+from recon.base.kernel import Kernel
+from recon.base.method import Method, Plain
+from recon.methods import by_name
+from recon.splatting.fit_method import FitMethod
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
+
+Depth = Literal["quick", "full"]
+
+_WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
+_LEAST_OF_PART = 6  # views
+_SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
+_BASE_STEPS = {"quick": 250, "full": 1000}
+_STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
+_FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
+_PUBLISHED_STEPS = {"quick": (1000,), "full": (3000, 10_000)}
+_FIELD_STEPS = {"quick": (300,), "full": (1000, 3000)}
+_BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """One way in which a trade-off tries a method.
+
+    Attributes:
+        varies: the group of the trial: "method" for the baseline, else what differs from it.
+        settings: that differ from the defaults, by name as `recon.methods.build` takes them.
+        binning: of detector pixels.
+    """
+
+    varies: str
+    settings: Mapping[str, Plain] = field(default_factory=dict)
+    binning: int = 1
+
+
+def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+    """The settings that a trade-off tries on all views, the baseline first.
+
+    Args:
+        gaussians: how many a fit starts from by default.
+        depth: "quick" has fewer trials, and shorter ones.
+    """
+    return TRIALS.get(method, _baseline)(gaussians, depth)
+
+
+def work_of(method: Method, n_views: int, binning: int) -> float:
+    """A rough measure of the time that a run takes, to be compared within one method only."""
+    if isinstance(method, FitMethod):
+        count = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians or 0
+        spread = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
+        return (method.planned_steps or 0) * (1 + count / 2e4 * spread**2)
+    return n_views * (getattr(method, "iterations", None) or 1) / binning**3
+
+
+def _baseline(gaussians: int, depth: Depth) -> list[TrialSettings]:
+    return [TrialSettings("method")]
+
+
+def _iterations(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
+    """Numbers of iterations: the middle one is the baseline."""
+    numbers = {"quick": quick, "full": full}[depth]
+    base = numbers[len(numbers) // 2]
+    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
+    return [TrialSettings("method", {"iterations": base}), *others]
+
+
+def _beside_chosen(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
+    """Numbers of iterations beside the one that the data choose, the baseline."""
+    numbers = {"quick": quick, "full": full}[depth]
+    return [TrialSettings("method"), *(TrialSettings("iterations", {"iterations": n}) for n in numbers)]
+
+
+def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
+    base: dict[str, Plain] = {"steps": _BASE_STEPS[depth], "gaussians": gaussians}
+    found = [TrialSettings("method", base)]
+    found += [TrialSettings("steps", base | {"steps": n}) for n in _STEPS[depth] if n != base["steps"]]
+    counts = [max(1, round(factor * gaussians)) for factor in _FACTORS[depth]]
+    found += [TrialSettings("gaussians", base | {"gaussians": count}) for count in counts]
+    # A bin of two halves the detail across: a quarter of the Gaussians describes it.
+    coarse = max(1, gaussians // 4)
+    found += [
+        TrialSettings("binning", {"steps": steps, "gaussians": coarse}, binning=2) for steps in _BINNED_STEPS[depth]
+    ]
+    others = [kernel.value for kernel in Kernel if kernel is not FitSettings().kernel]
+    found += [TrialSettings("kernel", base | {"fit.kernel": name}) for name in others]
+    found.append(TrialSettings("start", base | {"start": "tv"}))
+    found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
+    found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
+    found.append(TrialSettings("rectification", base | {"fit.rays.rectified": False}))
+    return found
+
+
+def _fields(gaussians: int, depth: Depth) -> list[TrialSettings]:
+    base, *longer = ({"steps": steps} for steps in _FIELD_STEPS[depth])
+    return [TrialSettings("method", base), *(TrialSettings("steps", one) for one in longer)]
+
+
+def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
+    """The published fit in fewer than its 30 000 steps, which would take a trade-off hours."""
+    base, *longer = ({"steps": steps, "gaussians": gaussians} for steps in _PUBLISHED_STEPS[depth])
+    return [TrialSettings("method", base), *(TrialSettings("steps", one) for one in longer)]
+
+
+TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
+    "r2": _fits,
+    "r2-published": _published,
+    **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
+    "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
+    "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
+    "osem": partial(_beside_chosen, (3, 12), (1, 3, 6, 12, 50)),
+    "mlem": partial(_beside_chosen, (12, 50), (4, 12, 24, 50, 200)),
+    "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
+    "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
+    "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),
+    "os-sirt-tv": partial(_iterations, (5, 15), (5, 10, 20, 40)),
+    "pnp-dct": partial(_iterations, (35,), (15, 35, 70)),
+}
+
+
+def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
+    """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
+
+    Args:
+        methods: names in `recon.methods`, in the order wanted.
+        gaussians: how many a fit would start from by itself.
+        depth: "quick" has about half as many trials as "full", and shorter ones.
+
+    Raises:
+        ValueError: for a method that there is not.
+    """
+    counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
+    first: list[Trial] = []
+    rest: list[Trial] = []
+    for method in methods:
+        base, *others = (
+            Trial(tried.varies, method, n_views, tried.binning, tried.settings)
+            for tried in trials_of(method, gaussians, depth)
+        )
+        first.append(replace(base, halves=True))
+        rest += [replace(base, group="views", views=n) for n in counts]
+        rest += others
+    return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
+
+
+def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
+    """Each method once, all with the same time."""
+    return tuple(base.in_time(seconds) for base in _baselines(methods, n_views, gaussians))
+
+
+def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
+    """The trials in an order for little time: each method once, direct ones first, without half-set resolutions.
+
+    These take two more reconstructions each, and say less than one of another method.
+    """
+    once = [replace(trial, halves=False) for trial in trials]
+    alone = [trial for trial in once if trial.group == "method"]
+    direct = [trial for trial in alone if by_name(trial.method).traits.direct]
+    return tuple(dict.fromkeys([*direct, *alone, *once]))
+
+
+def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
+    """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
+    alone = _baselines(methods, n_views, gaussians)
+    numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
+    joint = [Trial("one fit", "series", n_views, settings={"volumes": volumes, "motion": how}) for how in MOTION]
+    return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *joint
+
+
+def plan_of_energies(
+    methods: Sequence[str], n_views: int, gaussians: int, energies: int, states: bool
+) -> tuple[Trial, ...]:
+    """Each energy by itself with each method, then one fit of all materials, and with the share of two states."""
+    alone = [replace(base, group="parts", parts=energies) for base in _baselines(methods, n_views, gaussians)]
+    joint = [Trial("one fit", "materials", n_views)]
+    joint += [Trial("one fit", "materials", n_views, settings={"share": True})] if states else []
+    return *alone, *joint
+
+
+def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Trial]:
+    """In short runs."""
+    first = [trials_of(method, gaussians, "quick")[0] for method in methods]
+    return [Trial("method", name, n_views, settings=one.settings) for name, one in zip(methods, first, strict=True)]
+
+
+def work(trial: Trial) -> float:
+    """A rough number for how long a trial takes, to be compared within one method only."""
+    if (fit := trial.joint) is not None:
+        return trial.views * fit.work
+    return work_of(trial.build(), trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A trial that is done, and where its time went.
+
+    Attributes:
+        wall: s, from before its process began to after its end.
+        working: s of these that it reconstructed, which grow with the work; the rest is the same for all.
+    """
+
+    trial: Trial
+    wall: float
+    working: float
+
+    @classmethod
+    def of(cls, outcome: Outcome, wall: float) -> Timed:
+        """The times of a trial that has ended; one without figures has 0 s of work."""
+        seconds = outcome.seconds * (_WITH_HALVES if outcome.trial.halves else 1)
+        return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
+
+
+def seconds_left(done: Sequence[Timed], left: Sequence[Trial]) -> float | None:
+    """How long the trials that are left will take, from those done; None before the first.
+
+    Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
+    a method not yet seen is taken to cost what the others did on average, and one with a time to take it.
+    """
+    if not done:
+        return None
+    fixed = sum(one.wall - one.working for one in done) / len(done)
+    typical = sum(one.working for one in done) / len(done)
+    total = 0.0
+    for trial in left:
+        if trial.seconds_asked is not None:
+            total += fixed + trial.seconds_asked
+            continue
+        same = [one for one in done if one.trial.method == trial.method and one.working > 0]
+        amount = sum(work(one.trial) for one in same)
+        total += fixed + (work(trial) * sum(one.working for one in same) / amount if amount > 0 else typical)
+    return total

@@ -1,0 +1,180 @@
+"""The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import I64
+from recon.base.views import parse_views
+
+COUNTS = 360, 180, 90, 45
+SECTORS = ((30, 150, 120), (45, 135, 90), (60, 120, 60))
+"""First and last degree, and views at one a degree: the counts fall with the sector."""
+EQUAL_COUNTS = 120, 60
+DISJOINT_DEG = 1.0, 2.0, 3.0
+OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
+OVERLAPPING = 180  # Number of overlapping windows of each width
+_APART = 0.25  # px between views of a window: a mean of views that lie further apart is blurred
+
+
+@dataclass(frozen=True, eq=False)
+class ViewChoice:
+    """A choice of views, each the mean of some views of the scan.
+
+    Attributes:
+        label: in tables.
+        groups: int64 [view, window]: each view is the mean of these views of the scan; None: left out.
+        family: choices of the same family are draws of the same kind; empty: it stands alone.
+        reason: why it is left out.
+    """
+
+    label: str
+    groups: I64 | None
+    family: str = ""
+    reason: str = ""
+
+    @property
+    def window(self) -> int:
+        """How many views of the scan are averaged into one."""
+        return 0 if self.groups is None else self.groups.shape[1]
+
+    @property
+    def frames(self) -> int:
+        """Frames of the scan that it takes, each counted once: its dose."""
+        return 0 if self.groups is None else np.unique(self.groups).size
+
+    @property
+    def n_views(self) -> int:
+        return 0 if self.groups is None else self.groups.shape[0]
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """The views that a study chooses from.
+
+    Attributes:
+        angles: [view], radians.
+        period: radians after which views see the same rays, see `Geometry.period`.
+        seed: of the first random draw.
+        draws: how often a random choice is repeated.
+        places: [view, place], px, how far poses move the image or its edge; None: views lie alike.
+    """
+
+    angles: NDArray[np.float64]
+    period: float
+    seed: int = 0
+    draws: int = 3
+    places: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question to a scan, and the rows that answer it.
+
+    Attributes:
+        name: on the command line; `title`: of its page.
+        rows: all rows, those that the scan is too small for with the reason.
+    """
+
+    name: str
+    title: str
+    question: str
+    rows: Callable[[ViewSet], Sequence[ViewChoice]]
+
+
+def fixed_views(views: ViewSet) -> list[ViewChoice]:
+    """Falling numbers of views, evenly spread."""
+    return [_fixed(views, n) for n in COUNTS]
+
+
+def sector(views: ViewSet) -> list[ViewChoice]:
+    """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
+    falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
+    equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, own in SECTORS if n != own]
+    return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
+
+
+def random(views: ViewSet) -> list[ViewChoice]:
+    """Falling numbers of views, evenly spread and drawn at random."""
+    rows = []
+    for n in COUNTS:
+        rows.append(_fixed(views, n))
+        family = f"random, {n} views"
+        if n == views.angles.size:
+            rows.append(ViewChoice(family, None, family, "these are all views of the scan: nothing to draw"))
+            continue
+        for k in range(views.draws if n < views.angles.size else 1):
+            rows.append(_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family))
+    return rows
+
+
+def window_average(views: ViewSet) -> list[ViewChoice]:
+    """Means of neighbouring views, in windows that do not overlap, then in overlapping ones; single views first."""
+    single = [_fixed(views, n) for n in (OVERLAPPING, 90, 60)]
+    disjoint = [_windows(views, width, None) for width in DISJOINT_DEG]
+    return [*single, *disjoint, *(_windows(views, width, OVERLAPPING) for width in OVERLAPPING_DEG)]
+
+
+STUDIES = {
+    study.name: study
+    for study in (
+        Study("fixed-views", "Fewer views", "What do fewer views, evenly spread, cost?", fixed_views),
+        Study("sector", "A narrower sector", "What does a narrower range of angles cost, beside fewer views?", sector),
+        Study("random", "Views at random", "Are views at random angles worse than evenly spread ones?", random),
+        Study("window-average", "Averaged views", "What do means of neighbouring views gain and cost?", window_average),
+    )
+}
+
+
+def _fixed(views: ViewSet, n: int) -> ViewChoice:
+    return _chosen(f"fixed, {n} views", f"fixed:{n}", views)
+
+
+def _sector(views: ViewSet, low: int, high: int, n: int) -> ViewChoice:
+    # A view and its mirror image half a turn apart see the same rays: a scan that begins at -90 degrees has them all.
+    return _chosen(f"sector {low}-{high}°, {n} views", f"sector:{low}-{high}:{n}", views, within=True)
+
+
+def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> ViewChoice:
+    """The row of a selection in the words of `parse_views`; `within`: its angles are those within a period."""
+    angles = np.mod(views.angles, views.period) if within else views.angles
+    try:
+        found = parse_views(spec, angles, period=views.period)
+    except ValueError as error:
+        return ViewChoice(label, None, family, str(error))
+    return ViewChoice(label, found[:, None], family)
+
+
+def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
+    """Means over `width` degrees: `count` windows evenly spread, or as many as do not overlap (None)."""
+    turn = 2 * np.pi
+    angles = views.angles if np.ptp(views.angles) < turn else np.mod(views.angles, turn)
+    order = np.argsort(angles, kind="stable")
+    step = float(np.median(np.diff(angles[order])))
+    w = round(np.radians(width) / step) if step > 0 else 0
+    kind = "side by side" if count is None else f"overlapping, {count} views"
+    label = f"mean of {w} ({width:g}°), {kind}"
+    if w < 2:
+        return ViewChoice(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
+    room = order.size - w + 1
+    n = order.size // w if count is None else count
+    if n < 2 or n > room:
+        return ViewChoice(
+            label, None, reason=f"asks for {max(n, 2)} windows of {w}; the {order.size} views hold {max(room, 0)}"
+        )
+    starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
+    groups = order[starts[:, None] + np.arange(w)]
+    together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
+    if together.sum() < 2:
+        return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
+    groups = groups[together].astype(np.int64)
+    apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
+    if apart > _APART:
+        return ViewChoice(
+            label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
+        )
+    return ViewChoice(label, groups)

@@ -1,0 +1,157 @@
+"""python -m recon.compiled [CHECKOUT ...]: compiles the kernels for every level, and packs them for this Python.
+
+Which kernels, and for which types, is taken from the archive, and from what numba has compiled for this checkout and
+for others that are named: after the tests, all that they call. So a kernel that is edited or new is compiled here for
+all levels, and everything else keeps its bytes. No kernel runs, so the machine need not have a level's instructions.
+"""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from recon.compiled import ROOT
+from recon.compiled.archive import archive_of, digest, member, read_sources, write_archive
+from recon.compiled.level import LEVELS
+
+PACKAGES = ("beamline", "recon", "simulators")
+Index = dict[Any, str]
+"""Names of files with object code by what they were compiled for: (types, processor, code)."""
+
+
+def main() -> int:
+    """Compile for each level in a process of its own, then pack."""
+    for level in LEVELS:
+        begin = time.perf_counter()
+        # numba before recon: the level holds although this processor may have another
+        run = "import numba, sys; from recon.compiled.__main__ import compile_for; compile_for(sys.argv[1:])"
+        words = [sys.executable, "-c", run, *(str(Path(checkout).resolve()) for checkout in sys.argv[1:])]
+        done = subprocess.run(words, cwd=ROOT, env=os.environ | level.environment, check=False)
+        sys.stdout.write(f"{level.name}: {time.perf_counter() - begin:.0f} s\n")
+        if done.returncode:
+            return done.returncode
+    archive = archive_of(sys.version_info[:2])
+    members = {module: files for module in _modules(ROOT) if (files := _packed(module))}
+    write_archive(archive, members, ROOT)
+    sys.stdout.write(f"{archive}: {len(members)} modules, {archive.stat().st_size / 1e6:.2f} MB\n")
+    return 0
+
+
+def compile_for(checkouts: Sequence[str]) -> None:
+    """Compile every kernel for the types that it is known with; what does not compile any more is left out."""
+    import numba
+    from numba.core.dispatcher import Dispatcher
+
+    compiled = 0
+    known = _signatures([ROOT, *map(Path, checkouts)])
+    for module in sorted({module for module, _ in known}):
+        loaded = importlib.import_module(module)
+        for value in list(vars(loaded).values()):
+            getattr(value, "_dispatcher", None)  # `beamline.core.jit` makes it when it is first asked for
+        kernels = [d for d in gc.get_objects() if issubclass(type(d), Dispatcher) and d.py_func.__module__ == module]
+        for kernel in kernels:
+            for types in known.get((module, kernel.py_func.__qualname__), ()):
+                try:
+                    kernel.compile(types)
+                    compiled += 1
+                except numba.core.errors.NumbaError as error:
+                    sys.stdout.write(f"{module}.{kernel.py_func.__qualname__}{types}: {type(error).__name__}\n")
+    sys.stdout.write(f"{compiled} signatures\n")
+
+
+def _modules(root: Path) -> list[str]:
+    """Modules beside whose source numba has compiled something."""
+    modules = set()
+    for package in PACKAGES:
+        for index in (root / package).rglob("__pycache__/*.nbi"):
+            source = index.parents[1] / f"{index.name.split('.')[0]}.py"
+            if source.is_file():
+                modules.add(".".join(source.relative_to(root).with_suffix("").parts))
+    return sorted(modules)
+
+
+def _indices(module: str, root: Path) -> list[Path]:
+    source = root.joinpath(*module.split("."))
+    return sorted((source.parent / "__pycache__").glob(f"{source.name}.*.{_tag()}.nbi"))
+
+
+def _tag() -> str:
+    return "py{}{}".format(*sys.version_info[:2])
+
+
+def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
+    """Types that kernels were compiled for, by module and name."""
+    archive, known = archive_of(sys.version_info[:2]), defaultdict[tuple[str, str], set[Any]](set)
+    packed: list[tuple[str, str, bytes]] = []
+    if archive.is_file():
+        packed += (
+            (module, name, content)
+            for module in read_sources(archive)
+            for name, content in member(archive, module).items()
+            if name.endswith(".nbi")
+        )
+    for root in roots:
+        packed += (
+            (module, path.name, path.read_bytes()) for module in _modules(root) for path in _indices(module, root)
+        )
+    for module, name, content in packed:
+        try:
+            importlib.import_module(module)  # its types
+        except ImportError:
+            continue
+        _, index = _read(content)
+        # tv._dual_step-94.py311.nbi, voxelize._filler.locals.kernel-155.py311.nbi
+        kernel = name.partition(".")[2].rsplit("-", 1)[0].replace(".locals.", ".<locals>.")
+        known[module, kernel].update(key[0] for key in index)
+    return known
+
+
+def _read(content: bytes) -> tuple[Any, Index]:
+    """The source's digest and the overloads of numba's index."""
+    version = pickle.loads(content)  # noqa: S301 - written by numba beside our own modules
+    import numba
+
+    if version != numba.__version__:
+        return None, {}
+    stamp, index = pickle.loads(content[len(pickle.dumps(version, -1)) :])  # noqa: S301
+    return stamp, index
+
+
+def _packed(module: str) -> dict[str, bytes]:
+    """The cache's files for the kernels of a module: what was compiled for a level, from the source as it is now."""
+    from numba import __version__
+    from numba.core.serialize import dumps
+
+    importlib.import_module(module)
+    source, files = str(digest(ROOT.joinpath(*module.split(".")).with_suffix(".py"))), dict[str, bytes]()
+    processors = {(level.name, level.features) for level in LEVELS}
+    for path in _indices(module, ROOT):
+        stamp, index = _read(path.read_bytes())
+        if stamp is None or stamp.hex() != source:
+            continue
+        renamed = {}
+        for key, name in index.items():
+            if tuple(key[1][1:]) in processors and (path.parent / name).is_file():
+                content = (path.parent / name).read_bytes()
+                renamed[key] = f"{path.stem}.{hashlib.sha256(content).hexdigest()[:16]}.nbc"
+                files[renamed[key]] = content
+        if renamed == index:
+            files[path.name] = path.read_bytes()
+        elif renamed:
+            ordered = dict(sorted(renamed.items(), key=lambda item: item[1]))
+            files[path.name] = pickle.dumps(__version__, -1) + dumps((stamp, ordered))
+    return files
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""The archive of compiled kernels: a zip with one member a module, made once and unpacked where numba looks for them.
+
+A member holds the files of numba's cache for the kernels of a module (indices, `.nbi`, and object code, `.nbc`), as a
+tar compressed by xz. `sources.json` says which source files its kernels were compiled from: the module and all that it
+imports of this project, since numba copies functions and constants of other modules into a kernel without noticing when
+they change. A member whose sources differ stays packed, so that those kernels are compiled anew.
+
+numba's files are pickles, which can run any code when they are loaded. The archive is part of the package and as
+trustworthy as its modules; it is unpacked into `__pycache__` beside these, where numba and Python keep theirs, and
+nowhere that is not as well protected.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import hashlib
+import io
+import json
+import lzma
+import struct
+import tarfile
+import uuid
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+SOURCES = "sources.json"
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, EOFError, RuntimeError, OverflowError, struct.error),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, tarfile.TarError),
+)
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same files make the same archive
+
+
+def archive_of(python: tuple[int, int]) -> Path:
+    """The archive for a minor version of Python, whether it is there or not."""
+    return Path(__file__).with_name("py{}{}.zip".format(*python))
+
+
+def unpack(archive: Path, root: Path) -> None:
+    """Unpacks the members whose sources under `root` are the archive's, once: a mark says that it was done.
+
+    An archive that is damaged or absent, or a folder that cannot be written, leaves numba to compile. A file is whole
+    when it gets its name, and object code has its name by its content, so several processes may unpack at once.
+    """
+    with contextlib.suppress(*_DAMAGE):
+        stat = archive.stat()
+        mark, state = archive.parent / "__pycache__" / f"{archive.stem}.unpacked", f"{stat.st_size} {stat.st_mtime_ns}"
+        if mark.is_file() and mark.read_text(encoding="ascii") == state:
+            return
+        with contextlib.suppress(*_DAMAGE):
+            _unpack(archive, root)
+        _write(mark, state.encode("ascii"))
+
+
+def _unpack(archive: Path, root: Path) -> None:
+    for module in fresh_members(archive, root):
+        folder = root.joinpath(*module.split(".")).parent / "__pycache__"
+        files = member(archive, module)
+        for name in sorted(files, key=lambda name: name.endswith(".nbi")):  # an index after what it names
+            _write(folder / name, files[name])
+
+
+def fresh_members(archive: Path, root: Path) -> Iterator[str]:
+    """Modules whose kernels were compiled from the sources that are under `root`."""
+    digests: dict[str, str | None] = {}
+    for module, sources in read_sources(archive).items():
+        for path in sources:
+            if path not in digests:
+                digests[path] = digest(root / path)
+        if all(digests[path] == expected for path, expected in sources.items()):
+            yield module
+
+
+def read_sources(archive: Path) -> dict[str, dict[str, str]]:
+    """Digests of the source files, by path under the root, of each member."""
+    with zipfile.ZipFile(archive) as packed:
+        sources: dict[str, dict[str, str]] = json.loads(packed.read(SOURCES))
+    return sources
+
+
+def member(archive: Path, module: str) -> dict[str, bytes]:
+    """The files of numba's cache for a module, by name."""
+    with zipfile.ZipFile(archive) as packed:
+        content = lzma.decompress(packed.read(module))
+    files = {}
+    with tarfile.open(fileobj=io.BytesIO(content)) as tar:
+        for entry in tar:
+            if (file := tar.extractfile(entry)) is not None and entry.name == Path(entry.name).name:
+                files[entry.name] = file.read()
+    return files
+
+
+def write_archive(archive: Path, members: Mapping[str, Mapping[str, bytes]], root: Path) -> None:
+    """Writes the archive from the files of each module; the same files make the same bytes."""
+    sources = {}
+    with zipfile.ZipFile(archive, "w") as packed:
+        for module, files in sorted(members.items()):
+            sources[module] = {path: str(digest(root / path)) for path in source_files(module, root)}
+            packed.writestr(zipfile.ZipInfo(module, _EPOCH), lzma.compress(_tar(files), preset=9))
+        packed.writestr(zipfile.ZipInfo(SOURCES, _EPOCH), json.dumps(sources, indent=0), zipfile.ZIP_DEFLATED)
+
+
+def _tar(files: Mapping[str, bytes]) -> bytes:
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode="w") as tar:
+        for name, data in sorted(files.items()):
+            entry = tarfile.TarInfo(name)
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+    return content.getvalue()
+
+
+def digest(path: Path) -> str | None:
+    """A digest of a file's content; None where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+def source_files(module: str, root: Path) -> list[str]:
+    """A module and all modules of this project that it imports when it is loaded, by path under the root."""
+    paths, waiting = set[str](), [_file(module, root)]
+    while waiting:
+        path = waiting.pop()
+        if path is not None and path not in paths:
+            paths.add(path)
+            waiting += (_file(name, root) for name in _imported(root / path))
+    return sorted(paths)
+
+
+def _file(module: str, root: Path) -> str | None:
+    path = "/".join(module.split(".")) + ".py"
+    return path if (root / path).is_file() else None
+
+
+def _imported(path: Path) -> Iterable[str]:
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(statement, ast.Import):
+            yield from (name.name for name in statement.names)
+        elif isinstance(statement, ast.ImportFrom) and statement.module is not None:
+            yield statement.module
+            yield from (f"{statement.module}.{name.name}" for name in statement.names)
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    new = path.with_name(f"{path.name[:32]}.{uuid.uuid4().hex}.tmp")
+    try:
+        new.write_bytes(content)
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)

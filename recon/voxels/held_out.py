@@ -1,0 +1,287 @@
+"""Views held out: the one rule that chooses strengths, priors, first volumes and methods, and the trials it judges by.
+
+One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
+view held out is measured. Candidates are compared view by view, since views differ more than candidates do. Of those
+within one standard error of the best, the simplest is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64, median_deviation
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.ordered_fista import Subsets, ordered_fista
+from recon.voxels.projector import Projector
+from recon.voxels.sweeps import whitened
+from recon.voxels.voxel_problem import VoxelProblem
+
+ONE_IN = 8  # views held out
+LEAST_VIEWS = 2 * ONE_IN
+
+_ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
+TRIAL_ROWS = 16
+"""Rows of the slab that trials of a prior see."""
+
+_SWEEPS, _SUBSETS, _TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
+_OCTAVES = 10  # from the first strength, at most: cones of coarse voxels, and a shell of hardly any noise, take 6 to 9
+CHOICE_SWEEPS = 4 * _SWEEPS
+"""Sweeps of trials for a weight, as a rule."""
+_COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
+_MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
+
+
+def simplest(residuals: Sequence[F64]) -> int:
+    """Which candidate to take, by residuals [view held out] of each, from the simplest to the most costly one.
+
+    The first whose residuals exceed those of the best by no more than one standard error of the mean difference.
+    """
+    best = min(residuals, key=lambda one: float(one.mean()))
+    alike = (n for n, one in enumerate(residuals) if one is best or not beyond_chance(one - best, _ERRORS))
+    return next(alike)
+
+
+def beyond_chance(gains: F64, errors: float) -> bool:
+    """The mean of gains [view held out] is more than so many of its standard errors, by their scatter."""
+    scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
+    return float(gains.mean()) > errors * scatter
+
+
+def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Views to reconstruct from, and one of so many to judge by, evenly spread in angle."""
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+    unseen = np.sort(order[one_in // 2 :: one_in])
+    return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
+
+
+def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
+    """Rows first..stop of a parallel beam, and the slices that they see, as wide as `grid`.
+
+    If rows do not show slices, these are all slices that any ray to the rows meets.
+    """
+    views = geometry.rows(first, stop)
+    slab = Grid.matching(views)
+    if not geometry.rows_show_slices:
+        low, high = views.heights
+        slices = math.ceil((high - low + 2 * geometry.lean) / geometry.sample_pitch)
+        slab = replace(slab, shape=(slices, *slab.shape[1:]), centre=((low + high) / 2, 0.0, 0.0))
+    shape, centre = (slab.shape[0], *grid.shape[1:]), (slab.centre[0], *grid.centre[1:])
+    return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
+
+
+def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
+    """So many rows in the middle of a cone, as a geometry, and the box that holds their rays.
+
+    None: views are displaced along the rows, or these rows show little of the matter in `data` [view, row, col].
+    """
+    first = round(geometry.axis_row - (height - 1) / 2)
+    rows = slice(first, first + height)
+    if np.abs(geometry.shifts[:, 1]).max() > 1 or first < 0 or rows.stop > geometry.detector_shape[0]:
+        return None
+    some = data[:: max(1, len(data) // 8)]
+    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
+        return None
+    # At the far side of the field.
+    tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
+    slices = math.ceil(tall / grid.spacing[0])
+    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
+    return rows, geometry.rows(rows.start, rows.stop), box
+
+
+def busiest_rows(data: F32, height: int) -> slice:
+    """The neighbouring rows with most matter of line integrals [view, row, col]."""
+    rows = data.shape[1]
+    if rows <= height:
+        return slice(0, rows)
+    some = data[:: max(1, len(data) // 8)]
+    matter = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
+    first = int(np.argmax(matter[height:] - matter[:-height]))
+    return slice(first, first + height)
+
+
+def is_coarse(geometry: Geometry, grid: Grid) -> bool:
+    """Voxels cannot explain the edges of views. A volume that tries has ripples, which views held out hardly show."""
+    return grid.voxel_size >= _COARSE * geometry.sample_pitch
+
+
+def choice_sweeps(geometry: Geometry) -> float:
+    """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
+    share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Preferred:
+    """The strength of a prior that views held out prefer, and its residual of each [view]."""
+
+    strength: float
+    residuals: F64
+
+
+def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Preferred | None:
+    """The strength of a prior, a whole number of octaves from `first`, whose residual is least.
+
+    No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
+    standard error of the least is an octave or two above it: a teapot refined from a fit loses 1.1 dB by one.) The
+    search goes to stronger priors as long as they predict no worse beyond chance, else to weaker ones, as long as these
+    predict better. A volume that is too smooth misses edges of unseen views. One that follows the noise misses them by
+    its noise.
+
+    None: a residual is infinite, since the trials were ended.
+    """
+    tried = {octave: residuals_of(first * 2.0**octave) for octave in (1, 0)}
+    towards = -1 if beyond_chance(tried[1] - tried[0], _ERRORS) else 1
+    at = max(towards, 0)
+    while abs(at + towards) <= _OCTAVES:
+        tried[at + towards] = residuals_of(first * 2.0 ** (at + towards))
+        if beyond_chance(tried[at + towards] - tried[at], _ERRORS if towards > 0 else 0.0):
+            break
+        at += towards
+    if not all(np.isfinite(each).all() for each in tried.values()):
+        return None
+    octave = min(tried, key=lambda each: float(tried[each].mean()))
+    return Preferred(first * 2.0**octave, tried[octave])
+
+
+def choose_weight(
+    problem: VoxelProblem, start: F32, *, modelled: bool, trial: Callable[[], HeldOutTrial | None] | None = None
+) -> NoiseBalance | float:
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by views held out, where there are any, else by the noise.
+
+    μ is that of all views: noise and prior do not depend on their number. It is sought from FBP: a fit knows the views
+    held out, and any weight takes it away from them.
+
+    Args:
+        start, modelled: as of `NoiseBalance.of`.
+        trial: gives that of this problem; None: `HeldOutTrial.of`.
+    """
+
+    def chosen() -> list[float]:
+        balance = NoiseBalance.of(problem, start, modelled)
+        judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
+        found = None if judge is None else preferred_strength(judge.of_weight, balance.first)
+        return [balance.first, balance.noise] if found is None else [found.strength]
+
+    first, *noise = problem.decide("weight", chosen)
+    return NoiseBalance(first, noise[0]) if noise else first
+
+
+class HeldOutTrial:
+    """Volumes of a slab from seven of eight views, judged by the others.
+
+    Attributes:
+        problem: of the slab.
+        start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
+        unseen: the views held out.
+    """
+
+    def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
+        self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
+        self._subsets = Subsets.of(problem, _SUBSETS)
+        self._ended = False
+        self._known: dict[tuple[str, float], F64] = {}
+
+    @classmethod
+    def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
+        """The trial of the rows with most matter; of a cone of those in the middle.
+
+        None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
+        `problem.trial_goes_on` ends it.
+        """
+        geometry, grid = problem.projector.geometry, problem.projector.grid
+        if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
+            return None
+        images = problem.data.swapaxes(1, 2)
+        if not geometry.is_cone:
+            rows = busiest_rows(images, TRIAL_ROWS)
+            return cls._of_rows(problem, rows, *slab_of(geometry, grid, rows.start, rows.stop))
+        if geometry.detector_shape[0] <= TRIAL_ROWS:
+            return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)
+        middle = middle_of_cone(geometry, grid, images, TRIAL_ROWS)
+        return None if middle is None else cls._of_rows(problem, *middle)
+
+    @classmethod
+    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid) -> HeldOutTrial | None:
+        def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
+            def cut(rays: F32) -> F32:
+                return np.ascontiguousarray(rays[chosen][:, :, rows])
+
+            return replace(
+                problem,
+                projector=Projector(views.select(chosen), box),
+                data=cut(problem.data),
+                weight=None if problem.weight is None else cut(problem.weight),
+                rng=np.random.default_rng(0),
+                go_on=lambda *_: True,
+                decide=Decisions(),
+            )
+
+        seen, unseen = (of_views(some) for some in split_views(views))
+        if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
+            return None
+        first = seen.filtered("hann")
+        if first is None:  # no direct method takes these views
+            depth, height, width = box.shape
+            first = np.zeros((height, width, depth), np.float32)
+        return cls(seen, np.maximum(first, 0, out=first), unseen)
+
+    def _go_on(self, sweep: int, residual: float) -> bool:
+        self._ended = self._ended or not self.problem.trial_goes_on()
+        return not self._ended
+
+    @property
+    def ended(self) -> bool:
+        """The trials were ended; no volume is judged any more."""
+        return self._ended
+
+    def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
+        """`residuals` of the volume of this prior and strength, which is made once."""
+        if (prior, strength) not in self._known:
+            self._known[prior, strength] = self.residuals(volume(strength))
+        return self._known[prior, strength]
+
+    def of_weight(self, weight: float) -> F64:
+        """`residuals` of total variation with this weight."""
+        return self.residuals_of("weight", weight, self.with_weight)
+
+    def with_weight(self, weight: float) -> F32:
+        """The volume of total variation with this weight."""
+        return self.made(lambda part, x: ordered_fista(
+            part, x, weight, self._subsets, sweeps=_SWEEPS, tv_steps=_TV_STEPS
+        ))  # fmt: skip
+
+    def made(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
+        """The volume that `make` makes of the first one, which it may overwrite; that one where the trials ended."""
+        x = (self.start if start is None else start).copy()
+        if self._ended:
+            return x
+        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all
+
+    def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
+        """[view held out] what a volume [y, x, z] leaves of it; infinite where the trials were ended.
+
+        `beyond`: [view held out, col, row], what its model adds to its projection.
+
+        The root mean square, rays weighed. Of a cone the median deviation on rays through matter: coarse voxels cannot
+        explain the edges of its views, and a volume that tries has ripples.
+        """
+        unseen = self.unseen
+        if self._ended:
+            return np.full(len(unseen.data), np.inf)
+        left = unseen.projector.forward_lines(x) - unseen.data
+        if beyond is not None:
+            left += beyond
+        left = whitened(left, unseen.weight)
+        if unseen.projector.geometry.is_cone:
+            left[unseen.data <= _MATTER * np.percentile(unseen.data, 99)] = np.nan
+            return np.array([median_deviation(view) for view in left if np.isfinite(view).any()])
+        squares = [np.nanmean(np.square(view, dtype=np.float64)) for view in left if np.isfinite(view).any()]
+        return np.sqrt(np.array(squares))

@@ -1,0 +1,130 @@
+"""Photons of a scan file: their likelihood reaches every method as in Python, by itself where they are few."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.held_out import hold_out
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.reconstruct.budget import binned
+from recon.base.choices import Noise
+from recon.prep.counts import Counts, line_integrals
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import TwoCylinders
+
+SCAN = TwoCylinders(shape=(16, 64), axis_col=31.7)
+EXACT = SCAN.line_integrals()
+GAIN, DARK, READOUT = 7.0, 100.0, 6.0
+PLAIN = Selection(axis_col=31.7, steps=(Air("none"),))
+
+
+def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
+    """Darks, flats and views with so many photons a pixel in the open beam."""
+    rng, shape = np.random.default_rng(3), SCAN.shape
+    light = [np.zeros((n_darks, *shape)), np.full((n_flats, *shape), photons), photons * np.exp(-EXACT)]
+    counts = np.concatenate([DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light])
+    keys = [2] * n_darks + [1] * n_flats + [0] * len(EXACT)
+    angles = np.full(len(keys), np.nan)
+    angles[n_darks + n_flats :] = SCAN.angles
+    return ArraySource(counts.astype(np.float32), keys, angles)
+
+
+def prepare(source: ArraySource, selection: Selection, said: list[str] | None = None) -> PreparedProjections:
+    return prepare_projections(source, selection, ([] if said is None else said).append)  # type: ignore[arg-type]
+
+
+def test_line_integrals_and_weights_are_those_of_counts() -> None:
+    source = scan(20)
+    found = prepare(source, PLAIN.with_steps(CountModel("counts", GAIN))).projections
+    darks, flats, views = source.read(slice(10)), source.read(slice(10, 30)), source.read(slice(30, None))
+    variance = float(np.median(darks.var(axis=0, ddof=1)))
+    data, weights = line_integrals(Counts(views, flats.mean(axis=0), darks.mean(axis=0), GAIN, variance))
+    assert found.weights is not None
+    np.testing.assert_allclose(found.data, data, atol=2e-3)
+    np.testing.assert_allclose(found.weights, weights, rtol=2e-3)
+
+
+def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
+    """The likelihood chosen by itself, with the gain that the flats show."""
+    behind = 0.3 * EXACT.max() < EXACT
+    counted, logarithm = prepare(scan(10), PLAIN), prepare(scan(10), PLAIN.with_steps(CountModel("log")))
+    weights = counted.ray_weights()
+    assert weights is not None and logarithm.ray_weights() is None
+    assert abs(np.average((counted.projections.data - EXACT)[behind], weights=weights[behind])) < 0.03
+    assert np.mean((logarithm.projections.data - EXACT)[behind]) > 0.1
+    assert "10" in counted.done["noise"].said and logarithm.done["noise"].said == ""
+
+
+@pytest.mark.parametrize(("photons", "noise", "counted"), [
+    (30, "auto", True), (1000, "auto", False), (1000, "counts", True), (30, "log", False)
+])  # fmt: skip
+def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, counted: bool) -> None:
+    found = ScanCorrection(scan(photons), PLAIN.with_steps(CountModel(noise)), pytest.fail)  # type: ignore[arg-type]
+    assert (found.photons is not None) == counted
+    if found.photons is not None:
+        assert found.photons.gain == pytest.approx(GAIN, rel=0.1)
+        assert found.photons.variance**0.5 == pytest.approx(READOUT, rel=0.1)
+
+
+def test_binned_pixels_have_the_photons_of_all() -> None:
+    """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
+    for gain in (None, GAIN):
+        found = ScanCorrection(scan(20), replace(PLAIN, binning=2).with_steps(CountModel("counts", gain)), pytest.fail)  # type: ignore[arg-type]
+        assert found.photons is not None
+        assert found.photons.gain == pytest.approx(GAIN / 4, rel=0.1)
+        assert found.photons.variance == pytest.approx(READOUT**2 / 4, rel=0.2)
+
+
+def test_batches_give_what_one_pass_gives() -> None:
+    selection = PLAIN.with_steps(CountModel("counts"))
+    whole = ScanCorrection(scan(20), selection, pytest.fail).at_once(np.arange(30, 40))  # type: ignore[arg-type]
+    fed = ScanCorrection(scan(20), selection, pytest.fail)  # type: ignore[arg-type]
+    parts = [fed.feed(np.arange(30, 34), last=False), fed.feed(np.arange(34, 40), last=True)]
+    for name in ("data", "weights"):
+        together = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(together, getattr(whole, name))
+
+
+def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
+    prepared = prepare(scan(20), PLAIN.with_steps(CountModel("counts")))
+    held = hold_out(prepared, 9, advice="")
+    weights = prepared.ray_weights()
+    left = held.ray_weights(3)
+    assert weights is not None and left is not None and held.projections.weights is not None
+    assert left.shape == (len(EXACT) - 5 + 3, *SCAN.shape)
+    assert held.held_out is not None and len(held.held_out[0]) == 5 and (left[-3:] == 1).all()  # other views than held
+    alike = held.ray_weights(5)
+    assert alike is not None
+    apart = np.setdiff1d(np.arange(len(EXACT)), held.projections.view_ids - prepared.projections.view_ids[0])
+    both = np.concatenate((np.delete(weights, apart, 0), weights[apart]))
+    np.testing.assert_allclose(alike / alike.mean(), both / both.mean(), rtol=1e-5)
+    bins = binned(held, 2)
+    assert bins.held_out_weights is not None and bins.held_out is not None
+    assert bins.held_out_weights.shape == bins.held_out[0].shape
+    rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).held_out_weights
+    assert rows is not None and held.held_out_weights is not None
+    np.testing.assert_array_equal(rows, held.held_out_weights[:, 2:6])
+    coarse = binned(prepared, 2).projections
+    assert coarse.weights is not None and coarse.weights.shape == coarse.data.shape == (len(EXACT), 8, 32)
+
+
+def test_one_flat_does_not_tell_the_gain() -> None:
+    assert prepare(scan(20, n_flats=1), PLAIN).done["noise"].said == ""
+    with pytest.raises(ConfigError, match="--gain COUNTS"):
+        prepare(scan(20, n_flats=1), PLAIN.with_steps(CountModel("counts")))
+
+
+def test_line_integrals_have_no_photons() -> None:
+    source = scan(20)
+    source.quantity = "line_integrals"
+    with pytest.raises(ConfigError, match="not counts"):
+        prepare(source, PLAIN.with_steps(CountModel("counts")))

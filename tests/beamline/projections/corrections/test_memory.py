@@ -1,0 +1,161 @@
+"""What steps take of the memory is at most what they state, and the budget counts it."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.flags import Flags, usable_views
+from beamline.projections.corrections.hardening import Hardening
+from beamline.projections.corrections.jumps import Jumps
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.references import Flats
+from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
+from beamline.projections.corrections.rings import Rings
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
+from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.step import StepMemory
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.slabs import Needs, needs_of
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions, open_scan
+from recon.base.geometry import Geometry
+from recon.prep.correct import Projections
+from recon.prep.dynamic_flats import DynamicFlats, find_dynamic_flats, search_memory, view_memory
+from recon.prep.resample import Distortion
+from recon.voxels.direct import Fbp
+from tests.beamline.projections.corrections import test_jumps as of_jumps
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+LENS = Distortion.parse("xcenter = 80\nycenter = 120\nfactor0 = 1.0\nfactor1 = 2e-5\n")
+PAGANIN = {"material": "100", "distance_mm": 50.0, "energy_kev": 25.0}
+ON_VIEWS = [TiltAndLens(0.5), TiltAndLens(0.5, LENS), Phase(**PAGANIN), Phase(**PAGANIN, unsharp=(1.0, 0.5))]
+ON_ALL = {
+    "sort": Rings("sort"),
+    "vo": Rings("vo"),
+    "wavelet": Rings("wavelet"),
+    "auto": Air("auto"),
+    "surface": Air("surface:1"),
+    "background": pytest.param(Calibrate(("background",)), marks=pytest.mark.slow),
+    "gains": pytest.param(Calibrate(("gains",)), marks=pytest.mark.slow),
+    "fit": Hardening("fit"),
+    "aluminium": Hardening("Al:60kV,Al=1"),
+}
+
+
+def peak(work: Callable[[], object]) -> int:
+    """Bytes that it takes at most, once everything is imported and loaded."""
+    work()
+    tracemalloc.start()
+    work()
+    found = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return found
+
+
+def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
+    selection, views = Selection(steps=steps), source.image_key == 0
+    return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.angles[views]))
+
+
+def needs(path: Path, *steps: PrepStep) -> Needs:
+    output = OutputPaths(path.with_name("out.h5"), None)
+    options = ReconOptions(SourceOptions(path), output, Selection(steps=steps), Fbp())
+    with open_scan(SourceOptions(path)) as source:
+        return needs_of(source, options)
+
+
+@pytest.mark.parametrize("step", ON_VIEWS, ids=["tilt", "lens", "phase", "unsharp"])
+def test_a_step_takes_no_more_memory_than_it_states_and_the_budget_has_it(step: ViewStep, tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(240, 160)))
+    with open_scan(SourceOptions(path)) as source:
+        part = part_of(source, step)
+        found, _ = step.on(source, part.selection)
+    assert found is not None
+    for n in (2, 6):
+        masked, air = np.zeros((240, 160), bool), np.zeros((n, 2), np.float32)
+        views = Projections(np.ones((n, 240, 160), np.float32), np.arange(n), 0.0, air, masked)
+        taken, view = peak(lambda views=views: found.apply(views, 0)), views.data[0].nbytes  # type: ignore[misc]
+        assert step.memory(part).correcting - 2 * view < taken < step.memory(part).correcting
+    assert needs(path, step).steps.correcting == step.memory(part).correcting > needs(path).steps.correcting == 0
+
+
+@pytest.mark.parametrize("shape", [(60, 12, 96), (90, 20, 112)])
+@pytest.mark.parametrize("step", ON_ALL.values(), ids=ON_ALL)
+def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape: tuple[int, int, int]) -> None:
+    n, rows, cols = shape
+    angles, x = np.linspace(0, np.pi, n, endpoint=False), np.linspace(-1, 1, cols)
+    disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
+    rng = np.random.default_rng(0)
+    views = disc + rng.normal(0, 0.01, shape) + rng.normal(0, 0.02, (rows, cols))  # noise, and gains of pixels
+    part = ScanPart(
+        None, Selection(), Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2)
+    )  # type: ignore[arg-type]
+
+    def work() -> None:
+        data, ones = views.astype(np.float32), np.ones(n, np.float32)
+        found = Projections(data, np.arange(n), 0.0, ones, np.zeros((rows, cols), bool))
+        prepared = PreparedProjections(found, part.geometry, (cols - 1) / 2, None, None, n, "px", "counts")
+        assert step.apply(prepared, angles, lambda n, of: None).said
+
+    assert 0.25 * step.memory(part).alone < peak(work) - 4 * views.size < step.memory(part).alone
+
+
+@pytest.mark.parametrize(("pixels", "flats"), [((50, 80), 12), ((120, 200), 20)])
+def test_dynamic_flats_take_no_more_than_they_state(pixels: tuple[int, int], flats: int) -> None:
+    rng, size = np.random.default_rng(0), pixels[0] * pixels[1]
+    images = 1e4 + rng.normal(0, 20, (flats, *pixels)).astype(np.float32)
+    taken = peak(lambda: find_dynamic_flats(lambda: iter(images), rng))
+    assert 0.5 * search_memory(flats, size) < taken < search_memory(flats, size)
+    found = DynamicFlats(images[0], rng.normal(0, 1, (10, *pixels)).astype(np.float32))
+    taken = peak(lambda: found.flat_of(images[1] / 2)) + found.components.nbytes
+    assert 0.5 * view_memory(flats, size) < taken < view_memory(flats, size)
+
+
+def test_the_search_of_the_tilt_takes_no_more_than_it_states(tmp_path: Path) -> None:
+    path, step = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(40, 64))), TiltAndLens("auto")
+    with open_scan(SourceOptions(path)) as source:
+        part = part_of(source, step)
+        frames = usable_views(source, True).frames
+        taken = peak(lambda: with_tilt(source, part.selection, frames, pytest.fail, lambda n, of: None))  # type: ignore[arg-type]
+        assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
+        assert step.memory(part).correcting >= replace(step, tilt=0.5).memory(part).correcting > 0
+
+
+@pytest.mark.slow
+def test_the_search_of_a_jump_takes_no_more_than_it_states(tmp_path: Path) -> None:
+    path, step = of_jumps.scan(tmp_path, of_jumps.moved(1.5, 1.0), of_jumps.JUMP), Jumps()
+    with open_scan(SourceOptions(path)) as source:
+        part = part_of(source, step)
+        usable = usable_views(source, True)
+        taken = peak(lambda: step.place(source, part.selection, usable, 23.5, lambda n, of: None))
+        assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
+
+
+def test_a_scan_without_a_jump_needs_no_memory_for_it_unless_the_monitor_is_to_look(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(8, 40)))
+    with open_scan(SourceOptions(path)) as source:
+        stated = [Jumps().memory(part_of(source, *steps)).alone for steps in ((), (Flags("judge"),))]
+    assert stated[0] == 0 < stated[1]
+
+
+def test_the_budget_counts_the_largest_step_that_is_alone_in_memory(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(4, 96)))
+    steps = Air("none"), Rings("vo"), Hardening("fit"), Flats("dynamic")
+    with open_scan(SourceOptions(path)) as source:
+        stated = [step.memory(part_of(source, *steps)) for step in steps]
+    found = needs(path, *steps)
+    assert found.steps == StepMemory.of_all(stated)
+    large = replace(found, steps=StepMemory(alone=10**9))
+    assert large.least == 10**9 > found.least and large.at_once - found.at_once > 9e8
+    longest = steps[int(np.argmax([each.alone for each in stated]))]
+    assert max(large.parts, key=large.parts.__getitem__) == f"the step {longest.name}"

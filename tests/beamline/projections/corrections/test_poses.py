@@ -1,0 +1,280 @@
+"""Poses of views from a file become geometry: read, assigned to the views of a scan, and kept with the volume."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.monitor.digest import digest
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.poses import PosesOfFile
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.storage.pose_table import read_poses
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.direct import direct
+from recon.voxels.projector import seen_rays
+from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
+
+SHAPE, PITCH, AXIS = (24, 40), 0.04, 20.6
+N, FIRST = 40, 4  # views; row of the first one: two darks, two flats
+DEGREES = (np.arange(N) * 7 % N) * 180 / N  # in no order
+AXES, CENTRE = np.array([0.45, 0.3, 0.25]), np.array([0.1, -0.1, 0.04])
+SHIFTS = np.stack((3 * np.cos(np.arange(N)), 2 * np.sin(2 * np.arange(N))), axis=1)
+TURNS = np.stack((np.full(N, 1.5), 0.5 * np.cos(np.arange(N))), axis=1)
+COLUMNS = "shift_col_px,shift_row_px,roll_deg,tilt_deg"
+
+
+def posed(turns: np.ndarray = TURNS) -> Geometry:
+    return Geometry.parallel(
+        np.radians(DEGREES),
+        SHAPE,
+        pixel_pitch=PITCH,
+        axis_col=AXIS,
+        shifts=SHIFTS,
+        roll=np.radians(turns[:, 0]),
+        tilt=np.radians(turns[:, 1]),
+    )
+
+
+def scan(folder: Path, geometry: Geometry, axes: np.ndarray = AXES) -> Path:
+    counts, shape = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE)), geometry.detector_shape
+    images = [np.full(shape, level) + np.eye(*shape) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
+    angles = [np.nan] * 4 + geometry.angles.tolist()
+    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), shape, clock=SystemClock()) as writer:
+        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
+            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
+            writer.append(frame, digest(frame.counts), [])
+    return folder / "scan.h5"
+
+
+def table(folder: Path, head: str, *columns: np.ndarray, name: str = "poses.csv") -> Path:
+    rows = [",".join(repr(float(value)) for value in row) for row in zip(*columns, strict=True)]
+    (folder / name).write_text("\n".join(["# wobble", head, *rows]) + "\n")
+    return folder / name
+
+
+def every(folder: Path, by: str = "view") -> Path:
+    keys = {"view": np.arange(N), "frame": FIRST + np.arange(N), "angle_deg": DEGREES}[by]
+    order = np.random.default_rng(3).permutation(N)
+    return table(folder, f"{by},{COLUMNS}", *(column[order] for column in (keys, *SHIFTS.T, *TURNS.T)))
+
+
+def prepared(path: Path, poses: Path | str, **selected: object) -> PreparedProjections:
+    steps = (Air("none"), PosesOfFile(read_poses(str(poses))))
+    asked: dict[str, Any] = {"axis_col": AXIS, "steps": steps, **selected}
+    selection = Selection(**asked)
+    with SourceOptions(path).open() as source:
+        return prepare_projections(source, selection, lambda _: None)
+
+
+def error(found: PreparedProjections, axes: np.ndarray = AXES) -> float:
+    """Of FBP, relative, in the frame of the whole detector."""
+    grid = Grid.matching(found.geometry)
+    truth = smooth_ball(grid, axes, CENTRE)
+    return float(
+        np.linalg.norm(direct(found.projections.data, found.geometry, grid, "hann") - truth) / np.linalg.norm(truth)
+    )
+
+
+@pytest.mark.parametrize("by", ["view", "frame", "angle_deg"])
+def test_poses_are_those_of_the_file_in_any_order(tmp_path: Path, by: str) -> None:
+    found = prepared(scan(tmp_path, posed()), every(tmp_path, by))
+    for name in ("angles", "shifts", "roll", "tilt"):
+        np.testing.assert_allclose(getattr(found.geometry, name), getattr(posed(), name), atol=1e-12)
+    assert (
+        error(found)
+        < 0.2
+        < 0.5
+        * error(
+            replace(found, geometry=Geometry.parallel(np.radians(DEGREES), SHAPE, pixel_pitch=PITCH, axis_col=AXIS))
+        )
+    )
+    assert found.done["poses"].said.startswith("40 poses from")
+
+
+def test_no_pixel_is_resampled(tmp_path: Path) -> None:
+    path = scan(tmp_path, posed())
+    with SourceOptions(path).open() as source:
+        plain = prepare_projections(source, Selection(axis_col=AXIS, steps=(Air("none"),)), lambda _: None)
+    np.testing.assert_array_equal(prepared(path, every(tmp_path)).projections.data, plain.projections.data)
+
+
+def shadow_of_pixels(views: Geometry, n: int) -> np.ndarray:
+    """Line integrals of the mean light of n x n rays in each pixel."""
+    (rows, cols), middle = views.detector_shape, (n - 1) / 2
+    fine = replace(
+        views, detector_shape=(n * rows, n * cols), pixel_pitch=views.pixel_pitch / n, shifts=n * views.shifts,
+        axis_col=n * views.axis_col + middle, axis_row=n * views.axis_row + middle,
+    )  # fmt: skip
+    return -np.log(np.exp(-ellipsoid_shadow(fine, AXES, CENTRE)).reshape(-1, rows, n, cols, n).mean((2, 4)))
+
+
+@pytest.mark.parametrize(
+    "selected", [{"binning": 2}, {"rows": (3, 21)}, {"rows": (6, 20), "binning": 2}, {"views": "every:2"}], ids=str
+)
+def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, object]) -> None:
+    """The true sample explains the part's rays, also those of binned pixels and of rows off the middle."""
+    turns = TURNS * (4, 1)  # pivot about the detector's middle, not the rows' one
+    path = scan(tmp_path, posed(turns))
+    found = prepared(path, table(tmp_path, f"view,{COLUMNS}", np.arange(N), *SHIFTS.T, *turns.T), **selected)
+    left = found.projections.data - shadow_of_pixels(found.geometry, round(found.geometry.pixel_pitch / PITCH))
+    assert np.abs(left).max() < 0.02 and np.sqrt(np.mean(left**2)) < 0.002
+    assert found.geometry.n_views == (N // 2 if "views" in selected else N)
+    if found.held_out is not None:
+        data, views = found.held_out
+        np.testing.assert_allclose(data, ellipsoid_shadow(views, AXES, CENTRE), atol=0.012)
+
+
+def test_rays_outside_the_slices_weigh_nothing_also_of_views_held_out(tmp_path: Path) -> None:
+    path = scan(tmp_path, posed(), AXES * (1, 1, 20))
+    found = prepared(path, every(tmp_path), rows=(8, 16), views="every:2")
+    assert found.held_out is not None
+    n, others = found.geometry.n_views, found.held_out[1].n_views
+    weights, grid = found.ray_weights(others), Grid.matching(found.geometry)
+    assert weights is not None and weights.shape[0] == n + others and 0 < weights.mean() < 1
+    np.testing.assert_array_equal(weights[n:] > 0, seen_rays(found.held_out[1], grid))
+    assert not weights[n:].all()
+
+
+def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
+    drift = np.stack((np.linspace(0, 6, N)[np.argsort(np.argsort(DEGREES))], np.zeros(N)), axis=1)
+    geometry = replace(posed(0 * TURNS), shifts=drift)
+    found = prepared(
+        scan(tmp_path, geometry), table(tmp_path, "view,shift_col_px", np.arange(N), drift[:, 0]), axis_col=None
+    )
+    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+
+
+def test_poses_of_all_views_are_not_needed_where_some_are_chosen(tmp_path: Path) -> None:
+    path = scan(tmp_path, posed())
+    some = table(tmp_path, f"view,{COLUMNS}", *(column[::2] for column in (np.arange(N), *SHIFTS.T, *TURNS.T)))
+    with pytest.raises(DataError, match=r"no pose of 20 of the 40 views .*frame 5, at 31.5 degrees.*--views"):
+        prepared(path, some)
+    found = prepared(
+        path,
+        table(tmp_path, f"view,{COLUMNS}", *(c[:30] for c in (np.arange(N), *SHIFTS.T, *TURNS.T))),
+        views="first:20",
+    )
+    assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out[1].n_views <= 10
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", "first line is ''"),
+        ("view,x\n0,1\n", "first line is 'view,x'"),
+        ("view,shift_col_px\n", "header and no rows"),
+        ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
+        ("view,shift_col_px,shift_col_px\n0,1,2\n", "there twice"),
+        ("view,shift_col_px\n0,a\n", "'0,a' are not 2 numbers"),
+        ("view,shift_col_px\n0\n", "'0' are not 2 numbers"),
+        ("view,shift_col_px\n0,\n", "'0,' are not 2 numbers"),
+        ("view,shift_col_px\n0,nan\n", "view 0 has no finite shift"),
+        ("view,shift_col_px\n0,1\n0,2\n", "view 0 has 2 rows"),
+        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
+        ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected whole numbers"),
+        ("angle_deg,roll_deg\ninf,1\n", r"angle_deg holds \[inf\]; expected finite angles"),
+        ("view,tilt_deg\n3,86\n", "view 3 has a roll of 0 and a tilt of 86 degrees"),
+    ],
+)
+def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, match: str) -> None:
+    (tmp_path / "poses.csv").write_text(text)
+    with pytest.raises(ValueError, match=match):
+        read_poses(str(tmp_path / "poses.csv"))
+    with pytest.raises(ValueError, match=r"none\.csv cannot be read"):
+        read_poses(str(tmp_path / "none.csv"))
+
+
+def test_poses_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
+    path, views = scan(tmp_path, posed()), np.arange(N)
+    for head, columns, match in (
+        ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
+        (
+            "view,shift_col_px",
+            (views, np.full(N, 41.0)),
+            "view 0 is displaced by 41 columns and 0 rows on a detector of 40 x",
+        ),
+        (
+            "view,shift_row_px",
+            (views, np.full(N, 25.0)),
+            "view 0 is displaced by 0 columns and 25 rows on a detector",
+        ),
+        ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
+        ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),
+    ):
+        with pytest.raises(DataError, match=match):
+            prepared(path, table(tmp_path, head, *columns))
+    turned = (PosesOfFile(read_poses(str(every(tmp_path)))), TiltAndLens(1.0))
+    with pytest.raises(ConfigError, match="--tilt turns views"):
+        prepared(path, every(tmp_path), steps=turned)
+
+
+def nexus(folder: Path, **moved: np.ndarray) -> Path:
+    path = folder / "motors.nxs"
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        detector["data"] = np.zeros((FIRST + N, 2, 2), np.uint16)
+        detector["image_key"] = [2, 2, 1, 1] + [0] * N
+        for axis, values in moved.items():
+            item = file.create_dataset(f"entry/sample/{axis}_translation", data=np.append(np.zeros(FIRST), values))
+            item.attrs["units"] = "um"
+    return path
+
+
+def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) -> None:
+    geometry = replace(posed(0 * TURNS), shifts=SHIFTS)
+    path = scan(tmp_path, geometry)
+    motors = nexus(tmp_path, x=12e3 + 1e3 * PITCH * SHIFTS[:, 0], z=-1e3 * PITCH * SHIFTS[:, 1])
+    with pytest.raises(
+        ValueError,
+        match=r"^(?!.*damaged).*moves in x by 0.2\d* mm, z by 0.1\d* mm, and NeXus does not say where .*FILE:x,-y",
+    ):
+        read_poses(str(motors))
+    found = prepared(path, f"{motors}:x,-z").geometry.shifts
+    np.testing.assert_allclose(found - found[0], SHIFTS - SHIFTS[0], atol=1e-9)  # but for a common one
+    assert np.abs(np.median(found, axis=0)).max() < 1e-9
+    with pytest.raises(ValueError, match=r"y,x are not two of the translations there, x, z"):
+        read_poses(f"{motors}:y,x")
+    with pytest.raises(DataError, match="no shifts of a cone's views"):
+        prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
+    with pytest.raises(ValueError, match=r"^(?!.*damaged).*no sample/x_translation"):
+        read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
+
+
+@pytest.mark.slow
+def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> None:
+    roll, tilt = np.radians(TURNS.T)
+    angles, shift = 2 * np.radians(DEGREES), 6 * np.linspace(-1, 1, N)
+    geometry = Geometry.cone(
+        angles,
+        SHAPE,
+        1.5 * PITCH,
+        10.0,
+        15.0,
+        axis_col=AXIS,
+        shifts=np.stack((shift, SHIFTS[:, 1]), axis=1),
+        roll=roll,
+        tilt=tilt,
+    )
+    poses = table(tmp_path, f"view,{COLUMNS}", np.arange(N), shift, SHIFTS[:, 1], *TURNS.T)
+    found = prepared(
+        scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)
+    )
+    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+    left = found.projections.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
+    assert np.abs(left).max() < 0.02

@@ -1,0 +1,103 @@
+"""A scan whose end flats or darks are bad is reconstructed by the good ones; one without good ones is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.validate import source_findings
+from drivers.base.frame import FrameKind
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import BEAM, DARK, TwoCylinders
+
+SCAN = TwoCylinders()
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
+ACCEPT = SELECTION.with_steps(ReferenceCheck("accept"))
+FULL = 65535.0
+
+
+def source(
+    start: tuple[float, float] = (DARK, DARK + BEAM),
+    end: tuple[float, float] = (DARK, DARK + BEAM),
+    exposure: float = np.nan,
+) -> ArraySource:
+    """Three darks and three flats of these levels before the views and after them, with photon noise."""
+    rng = np.random.default_rng(7)
+
+    def references(levels: tuple[float, float]) -> list[np.ndarray]:
+        return [rng.normal(level, 0.01 * level, (3, *SCAN.shape)).clip(0, FULL) for level in levels]
+
+    views = DARK + BEAM * np.exp(-SCAN.line_integrals())
+    blocks = [*references(start), views, *references(end)]
+    keys = [kind for kind, block in zip((2, 1, 0, 2, 1), blocks, strict=True) for _ in block]
+    angles = np.full(len(keys), np.nan)
+    angles[np.array(keys) == FrameKind.PROJECTION] = SCAN.angles
+    return ArraySource(np.concatenate(blocks).round().astype(np.uint16), keys, angles, np.full(len(keys), exposure))
+
+
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [
+        ((DARK, DARK + 2), "The flats 54-56: there is no beam in them"),
+        ((DARK, DARK + 0.02 * BEAM), "The flats 54-56: 98% of the light of the flats 3-5 is gone"),
+        ((DARK, FULL + 3000), "The flats 54-56: 100.00% of their pixels are saturated"),
+        ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 51-53: there is light in them"),
+    ],
+)
+def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str) -> None:
+    told: list[str] = []
+    prepared = prepare_projections(source(end=end), SELECTION, told.append)  # type: ignore[arg-type]
+    # A mean of three flats with noise of 1 % is right to 0.6 %; a bad group would be off by far more.
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=0.03)
+    (line,) = told
+    assert line.startswith(said)
+    assert line.endswith(f"The other {said.split()[1]} are used instead.")
+    spoilt = prepare_projections(source(end=end), ACCEPT, told.append)  # type: ignore[arg-type]
+    assert np.abs(spoilt.projections.data - SCAN.line_integrals()).max() > 0.1
+    assert told[1].startswith("--references accept: ")
+
+
+@pytest.mark.parametrize(
+    ("levels", "said"),
+    [
+        ((DARK, FULL + 2000), "The flats 3-5, 54-56: .* of their pixels are saturated"),
+        ((DARK, DARK + 2), "The flats 3-5: there is no beam in them"),
+        ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 0-2: there is light in them"),
+    ],
+)
+def test_a_scan_without_a_good_group_is_refused_and_an_option_overrides(levels: tuple[float, float], said: str) -> None:
+    scan = source(levels, levels)
+    with pytest.raises(DataError, match=f"cannot be reconstructed. {said}.*--references accept"):
+        prepare_projections(scan, SELECTION, pytest.fail)  # type: ignore[arg-type]
+    errors = [f for f in source_findings(scan) if f.severity == "error"]  # type: ignore[arg-type]
+    n = 1 if "54" in said else 2  # the figures of two groups differ but where all of the pixels are at their end
+    assert {finding.rule for finding in errors} == {"bad-references"} and len(errors) == n
+    told: list[str] = []
+    assert prepare_projections(scan, ACCEPT, told.append).geometry.n_views == SCAN.angles.size  # type: ignore[arg-type]
+    assert len([line for line in told if line.startswith("--references accept")]) == n
+
+
+def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known() -> None:
+    """Flats with 2 % of the light, and nothing wrong with them beside one another; else an exposure may explain it."""
+    dim = (DARK, DARK + 0.02 * BEAM)
+    with pytest.raises(DataError, match=r"The flats 3-5, 54-56: they have 2.* of the light of the views .limit 50%"):
+        prepare_projections(source(dim, dim, 0.05), SELECTION, pytest.fail)  # type: ignore[arg-type]
+    assert prepare_projections(source(dim, dim), SELECTION, pytest.fail).geometry.n_views == 45  # type: ignore[arg-type]
+    fine = source(exposure=0.05)
+    assert prepare_projections(fine, SELECTION, pytest.fail).geometry.n_views == 45  # type: ignore[arg-type]
+    fine.exposures[np.array(fine.image_key) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
+    assert list(references_usable(fine)) == []  # type: ignore[arg-type]
+
+
+def test_good_references_are_all_used() -> None:
+    scan = source()
+    correction = ScanCorrection(scan, SELECTION, pytest.fail)  # type: ignore[arg-type]
+    assert correction.at_once(np.arange(6, 51)).view_ids.size == 45
+    assert {f for frames, _ in scan.was_read for f in frames} == set(range(57))

@@ -1,0 +1,144 @@
+"""Views of a tilted stage: as good a volume as of a straight one, slab by slab, and a warning where nobody asked."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event
+from beamline.core.phases import Phases
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel, Defects
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from recon.assess.metrics import psnr
+from recon.base.volume import Grid
+from recon.prep.resample import Distortion
+from recon.voxels.fbp import fbp
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import BEAM, DARK
+from tests.recon.prep.balls import Balls
+
+SELECTION = Selection(steps=(Air("none"),))
+STRAIGHT = Balls(np.radians(np.arange(0, 180, 3.0)), seed=3)
+
+
+@cache
+def _source(balls_tilt: float) -> ArraySource:
+    balls = replace(STRAIGHT, tilt_deg=balls_tilt)
+    counts = DARK + np.random.default_rng(7).poisson(BEAM * np.exp(-balls.views()))
+    frames = np.concatenate([np.full((1, *balls.shape), DARK), np.full((1, *balls.shape), DARK + BEAM), counts])
+    angles = np.concatenate([[np.nan] * 2, balls.angles])
+    return ArraySource(frames.astype(np.uint16), [2, 1] + [0] * balls.angles.size, angles)
+
+
+def _prepared(source: ArraySource, selection: Selection) -> tuple[PreparedProjections, list[str]]:
+    said: list[str] = []
+    return prepare_projections(source, selection, said.append), said  # type: ignore[arg-type]
+
+
+@cache
+def _truth(shape: tuple[int, int, int]) -> np.ndarray:
+    return STRAIGHT.truth(Grid(shape))
+
+
+def _quality(prepared: PreparedProjections) -> float:
+    """dB of the volume by FBP, in what all views of all these scans see."""
+    grid = Grid.matching(prepared.geometry)
+    inside = np.s_[4:-4, 8:-8, 8:-8]
+    return psnr(fbp(prepared.projections.data, prepared.geometry, grid)[inside], _truth(grid.shape)[inside])
+
+
+def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
+    """What was said of the tilt, and the degrees that the file records."""
+    done = prepared.done["tilt"]
+    assert done.parameters is not None
+    return done.said, done.parameters["tilt_deg"]
+
+
+def test_a_tilt_is_warned_of() -> None:
+    as_it_is, warned = _prepared(_source(1.5), SELECTION)
+    assert [text for text in warned if "seems to lean by 1." in text and "--tilt auto" in text]
+    assert _tilt(as_it_is) == ("", 0)
+
+
+@pytest.mark.slow
+def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> None:
+    straight, said = _prepared(_source(0.0), SELECTION)
+    assert not said and _tilt(straight) == ("", 0)
+    as_it_is, _ = _prepared(_source(1.5), SELECTION)
+    levelled, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens("auto")))
+    assert (
+        not said and _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
+    )
+    given, _ = _prepared(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).with_steps(TiltAndLens(1.5)))
+    for found in (levelled, given):
+        assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)
+        assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
+        assert _quality(found) > _quality(straight) - 0.3
+    assert _quality(as_it_is) < _quality(straight) - 1
+
+
+def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> None:
+    events: list[Event] = []
+    phases = Phases(events.append, SimpleNamespace(now=itertools.count(0.0, 1.0).__next__))
+    source, selection = _source(1.5), SELECTION.with_steps(TiltAndLens("auto"))
+    prepare_projections(source, selection, lambda text: None, phases=phases)  # type: ignore[arg-type]
+    told = [(event.data["phase"], event.data["n"], event.data["of"]) for event in events if event.data["n"]]
+    bands = [n for phase, n, _ in told if phase == "tilt and references"]
+    assert bands == sorted(bands) and bands[:16] == list(range(1, 17))
+    steps = [(n, of) for phase, n, of in told if phase.startswith("background")]
+    assert steps and steps == [(n, len(steps)) for n in range(1, len(steps) + 1)]
+
+
+def test_no_tilt_changes_nothing() -> None:
+    plain, _ = _prepared(_source(1.5), SELECTION)
+    zero, said = _prepared(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
+    assert not said and _tilt(zero)[0] == "" and zero.measured is None
+    np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
+    found, said = _prepared(_source(0.0), SELECTION.with_steps(TiltAndLens("auto")))
+    assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
+
+
+def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
+    prepared, _ = _prepared(_source(0.0), replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens(5.0)))
+    assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
+    assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
+    weights = prepared.ray_weights()
+    assert weights is not None and not weights[:, ~prepared.measured].any()
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize("lens", [None, Distortion(50.0, 30.0, (1.0, 3e-4, -4e-6))])
+def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion | None) -> None:
+    plain = Air("none"), Defects(zinger_threshold=1e9)  # zingers are judged by the rows that are there
+    selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
+    source, frames = _source(1.5), np.arange(2, 30)
+    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    whole = correction.at_once(frames).data
+    np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
+    rows = replace(selection, rows=(8 * binning, 14 * binning))
+    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data  # type: ignore[arg-type]
+    np.testing.assert_array_equal(band, whole[:, 8:14])
+    out = np.empty(whole.shape, np.float32)
+    np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)
+
+
+def test_what_cannot_be_levelled_is_refused() -> None:
+    source = _source(0.0)
+    with pytest.raises(ConfigError, match="--tilt is for a parallel beam; array is a cone"):
+        _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
+    with pytest.raises(ConfigError, match="--tilt and --distortion mix neighbouring pixels"):
+        _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), CountModel("counts")))
+    few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
+    with pytest.raises(DataError, match="the tilt of the axis was not found"):
+        _prepared(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

@@ -1,0 +1,171 @@
+"""The width of rays: asked for, or the motion that the file of a fly scan states."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import recon
+from beamline.core.errors import ConfigError
+from beamline.core.sinks import Warnings
+from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.width import Width
+from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.step import StepDone, options_of
+from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.output_paths import OutputPaths
+from beamline.simulate.scene_file import Scan, open_scene
+from beamline.simulate.write import write_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
+from recon.base.geometry import Geometry
+from simulators.devices.clock import VirtualClock
+from tests.beamline.array_source import ArraySource
+
+SHAPE = (64, 200)
+STEP, PERIOD, EXPOSURE, ROW = math.radians(2), 0.5, 0.4, 1e-3
+ARC, SKEW = math.radians(1.6), math.radians(4e-3)  # in an exposure, and from row to row
+
+
+def _source(mode: str = "fly", sense: float = 1.0, row_period: float | None = ROW, exposure: float = EXPOSURE) -> Any:
+    keys = [2, 1, *[0] * 90]
+    angles = np.r_[np.nan, np.nan, sense * STEP * np.arange(90)]
+    angles[50] = np.nan  # of a view without an angle
+    source: Any = ArraySource(np.zeros((92, *SHAPE), np.uint16), keys, angles, np.r_[1.0, 1.0, np.full(90, exposure)])
+    source.plan, source.attributes, source.row_period = {"mode": mode}, {"period_s": PERIOD}, row_period
+    return source
+
+
+def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple[Geometry, Geometry, StepDone]:
+    chosen = selection or Selection()
+    before = geometry_of(source, chosen, 100.0, np.arange(0.0, 3.0, 0.1))
+    return before, *step.rays(source, chosen, before)
+
+
+def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
+    unknown = _source()
+    unknown.exposures[:] = np.nan
+    for source in (_source("step"), unknown):
+        before, after, done = _rays(Width(), source)
+        assert after is before and (done.said, done.parameters) == ("", {})
+    before, after, _ = _rays(Width(arc="none"), _source())
+    assert after is before
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_stage_that_hardly_moved_was_in_the_middle_of_the_exposure_too(sense: float) -> None:
+    """No width is modelled below a pixel; else the volume would be turned by half of the arc."""
+    before, after, done = _rays(Width(), _source(sense=sense, exposure=0.01))
+    turned = sense * STEP / PERIOD * 0.01 / 2
+    np.testing.assert_allclose(after.angles, before.angles + turned, rtol=0, atol=1e-15)
+    assert (after.width, after.skew) == (before.width, 0) and done.said == ""
+    assert done.parameters == {"middle_of_exposure_deg": pytest.approx(math.degrees(turned))}
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
+    before, after, done = _rays(Width(), _source(sense=sense))
+    assert after.width.arc == pytest.approx(ARC) and after.width.variance == 0
+    assert after.skew == pytest.approx(sense * SKEW)
+    np.testing.assert_allclose(after.angles, before.angles + sense * ARC / 2)
+    assert done.said == (
+        "In the model of the views a view is the mean over 1.6 degrees (2.8 px at the edge of the field), the last row "
+        f"sees {sense * 0.25:.2g} degrees more than the first."
+    )
+    assert done.parameters == {
+        "ray_width": "none",
+        "exposure_arc_deg": pytest.approx(sense * 1.6),
+        "readout_arc_deg": pytest.approx(sense * 0.252),
+    }
+
+
+def test_rows_and_bins_see_the_angles_of_their_rows() -> None:
+    whole = _rays(Width(), _source())[1]
+    part = _rays(Width(), _source(), Selection(rows=(10, 50), binning=4))[1]
+    np.testing.assert_allclose(part.angles, whole.rows(10, 50).binned(4).angles)
+    assert part.skew == pytest.approx(4 * SKEW)
+
+
+def test_a_motion_may_be_given_and_the_last_row_read_first() -> None:
+    before, after, _ = _rays(Width(arc="0.8:-0.63"), _source("step", row_period=None))
+    assert after.width.arc == pytest.approx(math.radians(0.8))
+    assert after.skew == pytest.approx(-math.radians(0.01))
+    np.testing.assert_allclose(after.angles, before.angles + math.radians(0.4))
+    backwards = _rays(Width(arc="0.8:-0.63"), _source("step", sense=-1))[1]  # the stage turned the other way
+    assert backwards.skew == pytest.approx(math.radians(0.01))
+
+
+def test_a_pixel_has_its_area_and_blur() -> None:
+    before, after, done = _rays(Width("0.6", "none"), _source(), Selection(binning=2))
+    assert (after.width.pixel, after.width.blur, after.skew) == (1, 0.3, 0)
+    np.testing.assert_array_equal(after.angles, before.angles)
+    assert done.said == "In the model of the views a pixel has its own area and a blur of 0.6 px."
+
+
+def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
+    source = _source()
+    source.cone, source.pixel_size_mm = (100.0, 150.0), 0.01
+    _, after, _ = _rays(Width(), source)
+    assert after.width.arc > 0 and after.skew == 0
+    with pytest.raises(ConfigError, match="is a cone"):
+        _rays(Width(arc="1:0.1"), source)
+
+
+@pytest.mark.parametrize("term", ["roll", "tilt"])
+def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: str) -> None:
+    learnt = Selection().with_steps(Calibrate((term,)))
+    _, after, done = _rays(Width(), _source(), learnt)
+    assert after.width.arc > 0 and after.skew == 0 and done.parameters["readout_arc_deg"] == 0
+    with pytest.raises(ConfigError, match="calibrated"):
+        _rays(Width(arc="1:0.1"), _source(), learnt)
+    assert _rays(Width(), _source(), Selection().with_steps(Calibrate(("axis", "shifts"))))[1].skew > 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"spread": "wide"},
+        {"spread": "-1"},
+        {"spread": "500"},
+        {"arc": "-1"},
+        {"arc": "1:2:3"},
+        {"arc": "x"},
+        {"arc": "720"},
+    ],
+)
+def test_other_words_are_refused(words: dict[str, str]) -> None:
+    (field, text), options = *words.items(), options_of(Width)
+    with pytest.raises(ValueError, match="is neither"):
+        options[field].parse(text)
+
+
+@pytest.mark.parametrize("effects", [["motion_blur", "rolling_shutter"], []])
+def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: list[str]) -> None:
+    sizes = ["detector.shape=[4, 16]", "scan.views=6", "scan.darks=1", "scan.flats=1", "phantom.n_particles=5"]
+    scene = open_scene("fast_fly", [*sizes, f"effects={effects}"])
+    scan = Scan.of(scene.scene)
+    write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
+    with open_scan(tmp_path / "scan.h5") as source:
+        geometry = geometry_of(source, Selection(), 7.5, source.angles[2:])
+        seen, done = Width(arc="auto").rays(source, Selection(), geometry)
+        assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
+    moved = math.radians(180) / 6 / scan.period * 0.012
+    assert seen.width.arc == pytest.approx(moved if effects else 0)
+    assert (done.said != "") == bool(effects)
+
+
+def test_a_followed_scan_sees_the_middle_of_the_exposure_too(tmp_path: Path) -> None:
+    """Else its volume is turned by half of the arc from that of the finished scan, and its finish knows no motion."""
+    source, clock = _source(), VirtualClock()
+    options = ReconOptions(SourceOptions("scan.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(), recon.R2())
+    follower = ScanFollower(options, source, lambda event: None, clock, Warnings(lambda event: None, clock))
+    ids = np.arange(2, 40)
+    turned = ARC / 2 + SKEW * (SHAPE[0] - 1) / 2
+    np.testing.assert_allclose(follower._angles(ids, 100.0), source.angles[ids] + turned)
+    geometry, done = follower._seen(100.0, ids)
+    assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
+    assert done["width"].parameters["exposure_arc_deg"] == pytest.approx(1.6)

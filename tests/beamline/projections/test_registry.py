@@ -1,0 +1,64 @@
+"""Steps: their order, their options by their defaults, and what the file records of one that says nothing itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.rings import Rings
+from beamline.projections.protocols import ScanPart
+from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
+from beamline.projections.selection import Selection
+from beamline.projections.step import StepDone, key_of, option, options_of
+from beamline.projections.steps import step as old
+
+
+def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:
+    names = [step.name for step in all_steps()]
+    assert len(set(names)) == len(registered()) == len(names)
+    assert all(names.index(before) < names.index(step.name) for step in all_steps() for before in step.follows)
+
+
+def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
+    options = [each for step in registered() for each in options_of(step).values()]
+    values = {key_of(each.name): None if each.default is None else each.parse(each.default) for each in options}
+    assert len(values) == len(options)
+    assert steps_of(values) == tuple(step() for step in registered())
+    assert not any(step.needs_finished for step in steps_of(values))
+    with pytest.raises(ValueError, match="--gain is for counted photons"):
+        steps_of(values | {"noise": "log", "gain": 2.0})
+
+
+def test_a_selection_takes_one_step_of_a_kind() -> None:
+    selection = Selection(steps=(Rings("sort"),)).with_steps(Air("none"), Rings("vo"))
+    assert selection.steps == (Air("none"), Rings("vo"))
+    assert (selection.step(Rings).way, selection.step(Phase)) == ("vo", Phase())
+    assert [step.name for step in in_order(selection)] == [step.name for step in all_steps()]
+
+
+def test_a_plug_in_finds_the_names_where_they_were() -> None:
+    assert (old.option, old.StepDone, old.ScanPart) == (option, StepDone, ScanPart)
+    assert all(hasattr(old, name) for name in old.__all__)
+
+
+def test_the_file_records_what_a_step_says_or_its_options() -> None:
+    steps = [Flags("ignore"), CountModel("counts", 2.0), Rings("vo")]
+    done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
+    expected = {
+        "flags": "ignore",
+        "noise": "counts",
+        "gain": 2.0,
+        "noise_said": "counted",
+        "rings_removed": "none seen",
+    }
+    assert recorded(steps, done) == expected
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"), [("auto", ("auto", "auto")), ("3,4", ((3, 4), "none")), ("surface:2", ("auto", 2))]
+)
+def test_air_by_its_columns_and_its_surface(model: str, parts: object) -> None:
+    assert (Air(model).columns, Air(model).surface) == parts

@@ -1,0 +1,41 @@
+"""The live volume that fits beside a scan, and what is said of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from beamline.scan.live_plan import live_need, live_plan
+
+
+@pytest.mark.parametrize(
+    ("shape", "n_views", "free", "planned"),
+    [
+        ((256, 256), 180, 8e9, (1, 1)),
+        ((2048, 2048), 1800, 64e9, (4, 1)),
+        ((2304, 4096), 3600, 24e9, (8, 3)),
+        ((2048, 2048), 1800, 3e9, (8, 8)),
+        ((2048, 2048), 60, 24e9, (4, 1)),
+    ],
+)
+def test_the_live_volume_fits_into_half_of_the_memory(
+    shape: tuple[int, int], n_views: int, free: float, planned: tuple[int, int]
+) -> None:
+    plan = live_plan(shape, n_views, int(free))
+    assert (plan.binning, plan.every) == planned
+    assert plan.bytes <= free / 2
+
+
+def test_its_need_of_memory_and_the_reason_are_stated() -> None:
+    # 256² x (50 B x 256 + 40 B x 180) = 1.31 GB; 2304 x 4096 x (50 B x 4096 + 40 B x 3600) = 3.29 TB.
+    whole = live_need((256, 256), 180, int(8e9))
+    assert whole == (
+        "the live volume is of 180 views of 256 x 256 pixels, in about 1.31 GB of memory; it may take half of the 8 GB "
+        "that are free"
+    )
+    reduced = live_need((2304, 4096), 3600, int(24e9))
+    for part in (
+        "of 1200 views of 288 x 512 pixels", "one view of 3, pixels binned 8 x 8", "at most 512 columns",
+        "half of the 24 GB that are free", "all 3600 of 2304 x 4096 would take 3.29 TB",
+    ):  # fmt: skip
+        assert part in reduced
+    assert "columns" not in live_need((256, 256), 180, int(1e9))

@@ -1,0 +1,76 @@
+"""What a trade-off compares: views keep their times or energies through the split into used and held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions
+from beamline.trials.data import Data
+from beamline.trials.runner import ComparedScan
+from beamline.trials.table import TrialTable
+from beamline.trials.tradeoff import Several, TradeoffOptions, planned_tradeoff
+from recon.base.geometry import Geometry
+from simulators.light.palette import known
+from tests.beamline.cli.test_materials import ENERGIES, scans, spectra  # noqa: F401 - scans is a fixture
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+def asked(path: Path, axis_col: float) -> ComparedScan:
+    return ComparedScan(SourceOptions(path), Selection(axis_col=axis_col), path.parent / "out")
+
+
+def planned(scan: ComparedScan, several: Several, warn: Callable[[str], None]) -> tuple[Data, TrialTable]:
+    data, planned = planned_tradeoff(TradeoffOptions(scan, ("fbp",), several), warn)
+    return data, planned.table
+
+
+def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
+    """The file states no times: views follow each other evenly, which a warning says."""
+    path, said = write_exchange(tmp_path / "scan.h5", SCAN), list[str]()
+    data, table = planned(asked(path, SCAN.axis_col), Several(volumes=2), said.append)
+    assert data.held_out is not None and data.truth is None
+    angles = np.concatenate((data.geometry.angles, data.held_out[1].angles))
+    np.testing.assert_allclose(np.degrees(angles) / 6, data.shown)  # a view each 6 degrees and second
+    assert data.geometry.n_views == 27 and data.held_out[1].n_views == 3
+    assert any("states no time" in warning for warning in said)
+    assert "over 29 s" in table.scan["views used"]
+    assert [outcome.trial.group for outcome in table.outcomes] == ["method", "parts", "parts", *["one fit"] * 3]
+
+
+def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
+    pytest.importorskip("xraylib")
+    first, *others = (asked(path, 31.5) for path in scans)
+    several = Several(
+        others=[(one.source, one.selection) for one in others], spectra=spectra(tmp_path), states=("fresh", "charged")
+    )
+    data, table = planned(first, several, lambda said: None)
+    assert data.held_out is not None and data.sections is not None
+    assert data.geometry.n_views == 84 and data.held_out[1].n_views == 12
+    assert np.bincount(data.shown.astype(int)).tolist() == [24] * 4
+    oxide = known("NMC811")
+    assert oxide is not None and data.sections.shape == (len(ENERGIES), 2)
+    assert data.states == (0, 1) and table.scan["materials"] == "fresh, charged"
+    brightest = [max(float(image.max()) for image in data.projections[data.shown[:84] == e]) for e in range(4)]
+    assert np.argmin(brightest) == 0  # below the edge
+    assert [outcome.trial.method for outcome in table.outcomes] == ["fbp", "materials", "materials"]
+    assert isinstance(data.held_out[1], Geometry)
+
+
+def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with pytest.raises(Exception, match="never overwritten"):
+        planned(asked(tmp_path / "none.h5", 1.0), Several(spectra=tmp_path / "none.csv"), print)
+
+
+def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
+    several = Several(spectra=spectra(tmp_path), states=("fresh", "full"))
+    with pytest.raises(ConfigError, match="expected two of the materials fresh, charged"):
+        planned(asked(scans[0], 31.5), several, print)

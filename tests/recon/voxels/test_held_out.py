@@ -1,0 +1,236 @@
+"""Views held out: the rule, and the weight it finds: lighter than the one by the noise, or much heavier."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+import recon
+from recon import FistaTv, OsSirtTv
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.noise import noise_level
+from recon.base.volume import Grid
+from recon.kernels.cpu.activation import F32
+from recon.voxels.held_out import (
+    LEAST_VIEWS,
+    HeldOutTrial,
+    beyond_chance,
+    busiest_rows,
+    preferred_strength,
+    simplest,
+    slab_of,
+    split_views,
+)
+from recon.voxels.projector import Projector
+
+VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
+
+
+@pytest.fixture(scope="module")
+def foam() -> tuple[F32, Geometry, Grid, F32]:
+    """Struts with a fine texture, which total variation by the noise alone makes even: line integrals and truth."""
+    rng = np.random.default_rng(4)
+    shape = (ROWS, COLS, COLS)
+    struts, texture = (gaussian_filter(rng.normal(size=shape), s) for s in (1.5, 0.6))
+    _, y, x = np.indices(shape) - 31.5
+    truth = np.where((struts > 0.3 * struts.std()) & (np.hypot(x, y) < 29), 0.7 + 0.08 * texture / texture.std(), 0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    grid = Grid.matching(geometry)
+    clean = Projector(geometry, grid).forward(truth.astype(np.float32))
+    scale = 2 / clean.max()
+    counts = np.maximum(rng.poisson(PHOTONS * np.exp(-scale * clean)), 1)
+    return -np.log(counts / PHOTONS).astype(np.float32), geometry, grid, (scale * truth).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=lambda m: m.name)
+def test_a_texture_survives(
+    foam: tuple[F32, Geometry, Grid, F32], method: recon.Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, geometry, grid, truth = foam
+    peak = float(truth.max())
+    found = recon.reconstruct(data, geometry, method, grid=grid).volume.data
+    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    by_noise = recon.reconstruct(data, geometry, method, grid=grid).volume.data
+    monkeypatch.setattr("recon.voxels.noise_balance.noise_beside_structure", lambda lines, _: noise_level(lines))
+    by_texture = recon.reconstruct(data, geometry, method, grid=grid).volume.data  # the texture counts as noise
+    assert psnr(truth, found, peak) > psnr(truth, by_texture, peak) + 2
+    assert psnr(truth, by_noise, peak) > psnr(truth, by_texture, peak) + 1
+
+
+def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
+    truth = (np.hypot(x, y) < 25).astype(np.float32)
+    data = Projector(geometry, Grid.matching(geometry)).forward(truth)
+    data += rng.normal(0, 1, data.shape).astype(np.float32)
+    found = recon.reconstruct(data, geometry, FistaTv()).volume.data
+    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    by_noise = recon.reconstruct(data, geometry, FistaTv()).volume.data
+    assert psnr(truth, found) > psnr(truth, by_noise) - 1
+
+
+def test_faint_matter_around_metal_is_more_even_than_in_fbp(rng: np.random.Generator) -> None:
+    """By its noise alone the scan gets a weight for the metal, whose edges are most of the variation."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
+    truth = np.where(np.hypot(x, y) < 26, 0.002, 0) + np.where(np.hypot(x - 4, y) < 5, 0.2, 0)
+    data = Projector(geometry, Grid.matching(geometry)).forward(truth.astype(np.float32))
+    data += (rng.normal(0, 0.01, data.shape) * np.exp(data / 2)).astype(np.float32)
+    faint = (np.hypot(x, y) < 24) & (np.hypot(x - 4, y) > 8)
+    found, fbp = (recon.reconstruct(data, geometry, m).volume.data[faint].std() for m in (FistaTv(), recon.Fbp()))
+    assert found < 0.6 * fbp
+
+
+@pytest.fixture(scope="module")
+def cracked() -> tuple[F32, Geometry]:
+    """A disc with a straight crack two pixels wide and 0.9 deep, from 80 views of 300 photons a pixel."""
+    rng = np.random.default_rng(2)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), pixel_pitch=0.5)
+    _, y, x = (np.indices((ROWS, 2 * COLS, 2 * COLS)) - 63.5) / 2
+    truth = np.where((abs(y) < 1) & (abs(x) < 14), 0.1, 1.0) * (np.hypot(x, y) < 27) * 0.028
+    clean = Projector(fine, Grid((ROWS, 2 * COLS, 2 * COLS), 0.5, slice_pitch=0.5)).forward(truth.astype(np.float32))
+    light = np.exp(-clean).reshape(80, ROWS, COLS, 2).mean(axis=3)
+    return -np.log(np.maximum(rng.poisson(300 * light), 0.5) / 300).astype(np.float32), geometry
+
+
+def _depth(volume: F32) -> float:
+    profile = volume[:, :, 20:44].mean(axis=(0, 2), dtype=np.float64)
+    return 1 - float(profile[31:33].mean() / profile[[26, 27, 28, 35, 36, 37]].mean())
+
+
+def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
+    cracked: tuple[F32, Geometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
+    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    by_noise = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
+    fbp = _depth(recon.reconstruct(*cracked, "fbp").volume.data)
+    assert by_noise < 0.8 * fbp
+    assert found > 0.9 * fbp
+
+
+SCATTER = np.array([-0.3, 0.1, 0.4, -0.2, 0.0])  # of views, which all candidates share
+
+
+@pytest.mark.parametrize(
+    ("residuals", "taken"),
+    [((1.0, 1.1, 1.2), 0), ((1.2, 1.1, 1.0), 2), ((1.1, 1.0, 1.0), 1), ((1.004, 1.0, 1.1), 0), ((1.012, 1.1, 1.0), 2)],
+)
+def test_the_first_within_one_standard_error_of_the_best_is_taken(residuals: tuple[float, ...], taken: int) -> None:
+    """Differences scatter by 0.005 a mean, views by far more."""
+    by_view = np.array([-1.0, 1.0, -1.0, 1.0, 0.0]) * 0.005 * math.sqrt(5)
+    assert simplest([r + SCATTER + by_view * at for at, r in enumerate(residuals)]) == taken
+
+
+@given(
+    arrays(np.float64, (3, 6), elements=st.floats(0.5, 2.0)), st.floats(0.1, 10.0),
+    arrays(np.float64, 6, elements=st.floats(0.0, 5.0)),
+)  # fmt: skip
+def test_neither_the_unit_nor_what_views_share_changes_the_choice(
+    residuals: NDArray[np.float64], unit: float, shared: NDArray[np.float64]
+) -> None:
+    """And the one taken is no worse than the best beyond chance."""
+    gaps = np.abs(np.subtract.outer(residuals.mean(1), residuals.mean(1)))[np.triu_indices(3, 1)]
+    assume(gaps.min() > 1e-6)
+    at, best = simplest(list(residuals)), int(residuals.mean(1).argmin())
+    assert at <= best and not beyond_chance(residuals[at] - residuals[best], 1.0 + 1e-9)
+    margin = [abs((d := one - residuals[best]).mean() - d.std(ddof=1) / math.sqrt(6)) for one in residuals[:best]]
+    assume(all(each > 1e-6 for each in margin))
+    assert simplest(list(unit * (residuals + shared))) == at
+
+
+@pytest.mark.parametrize("best", [-5, -1, 0, 1, 2, 7])
+def test_the_strength_of_the_least_residual_is_found_to_an_octave(best: int) -> None:
+    found = preferred_strength(lambda strength: 1 + abs(math.log2(strength / 3) - best) + SCATTER, 3.0)
+    assert found is not None and found.strength == 3.0 * 2.0**best
+    np.testing.assert_allclose(found.residuals, 1 + SCATTER)
+
+
+def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones() -> None:
+    """As of a measured walnut of 25 views: level over three octaves, with a rise of 0.02 % each; then it falls."""
+    by_view = np.array([-1.0, 1.0, -1.0, 1.0, 0.0])
+
+    def residuals(strength: float) -> NDArray[np.float64]:
+        octave = math.log2(strength / 3)
+        mean = 1.08 + 0.0002 * octave if octave < 3 else 1 + abs(octave - 5) / 100
+        return mean + SCATTER + 0.01 * octave * by_view
+
+    found = preferred_strength(residuals, 3.0)
+    assert found is not None and found.strength == 3 * 32
+
+
+def test_trials_that_were_ended_prefer_nothing() -> None:
+    assert preferred_strength(lambda _: np.full(5, np.inf), 3.0) is None
+
+
+def test_few_views_are_not_held_out() -> None:
+    few = Geometry.parallel(np.linspace(0, 3, LEAST_VIEWS - 1), (4, 8))
+    assert HeldOutTrial.of(Mock(**{"projector.geometry": few})) is None
+
+
+@pytest.fixture(scope="module")
+def coarse_cone() -> tuple[F32, Geometry, Grid, F32]:
+    """Grains in a cone on voxels of twice the width that their views come from: line integrals and truth."""
+    fine = np.zeros((48, 64, 64), np.float32)
+    rng = np.random.default_rng(1)
+    z, y, x = np.indices(fine.shape)
+    for centre, radius in zip(rng.uniform(16, 32, (40, 3)) * (1, 1.5, 1.5), rng.uniform(3, 7, 40), strict=True):
+        fine[np.hypot(np.hypot(z - centre[0], y - 8 - centre[1] / 1.2), x - 8 - centre[2] / 1.2) < radius] = 0.02
+    geometry = Geometry.cone(np.linspace(0, 2 * np.pi, 32, endpoint=False), (64, 80), 1.4, 300.0, 420.0)
+    clean = Projector(geometry, Grid(fine.shape, 1.0)).forward(fine)
+    data = clean + rng.normal(0, 1e-3, clean.shape)
+    return data.astype(np.float32), geometry, Grid((24, 32, 32), 2.0), fine.reshape(24, 2, 32, 2, 32, 2).mean((1, 3, 5))
+
+
+def test_coarse_voxels_of_a_cone_get_the_weight_that_views_held_out_allow(
+    coarse_cone: tuple[F32, Geometry, Grid, F32], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, geometry, grid, truth = coarse_cone
+    found = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
+    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    by_noise = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
+    assert psnr(truth, found) > psnr(truth, by_noise) + 0.5
+
+
+def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
+    angles = np.random.default_rng(0).permutation(np.linspace(0, np.pi, 80, endpoint=False))
+    seen, unseen = split_views(Geometry.parallel(angles, (4, 8), pixel_pitch=1.0))
+    assert unseen.size == 10 and sorted([*seen, *unseen]) == list(range(80))
+    np.testing.assert_allclose(np.diff(np.sort(angles[unseen])), np.pi / 10)
+    assert LEAST_VIEWS == 16
+
+
+def test_a_slab_is_where_most_matter_is_and_sees_its_own_slices() -> None:
+    data = np.zeros((3, 40, 8), np.float32)
+    data[:, 20:30] = 1
+    rows = busiest_rows(data, 10)
+    assert rows == slice(20, 30)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 3), (40, 8), pixel_pitch=0.5)
+    views, box = slab_of(geometry, Grid.matching(geometry), rows.start, rows.stop)
+    volume = np.random.default_rng(1).random((40, 8, 8)).astype(np.float32)
+    whole = Projector(geometry, Grid.matching(geometry)).forward(volume)
+    np.testing.assert_allclose(Projector(views, box).forward(volume[rows]), whole[:, rows], rtol=1e-5)
+
+
+def test_views_held_out_that_weigh_nothing_in_the_busiest_rows_leave_the_weight_by_the_noise(
+    foam: tuple[F32, Geometry, Grid, F32],
+) -> None:
+    data, geometry, grid, _ = (np.concatenate([foam[0], foam[0] / 2], axis=1), *foam[1:])
+    geometry, grid = replace(geometry, detector_shape=(2 * ROWS, COLS)), replace(grid, shape=(2 * ROWS, COLS, COLS))
+    weights = np.ones_like(data)
+    weights[split_views(geometry)[1], :ROWS] = 0
+    found = recon.reconstruct(data, geometry, FistaTv(iterations=1), grid=grid, use=recon.DataUse(weights=weights))
+    assert np.isfinite(found.volume.data).all()

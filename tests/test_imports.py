@@ -1,0 +1,26 @@
+"""The product's modules import each other in one direction only, also within functions and for types alone."""
+
+from __future__ import annotations
+
+from graphlib import TopologicalSorter
+
+import grimp
+import pytest
+
+PACKAGES = ("beamline", "recon", "drivers", "simulators")
+JUMPS = "beamline.projections.corrections.jumps"
+
+
+@pytest.fixture(scope="module")
+def imported() -> dict[str, set[str]]:
+    """Modules of the product that each of its modules imports."""
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_no_module_imports_one_that_imports_it(imported: dict[str, set[str]]) -> None:
+    TopologicalSorter(imported).prepare()  # its CycleError names the circle
+
+
+def test_imports_in_functions_and_for_types_count(imported: dict[str, set[str]]) -> None:
+    assert {"beamline.projections.correction", "beamline.projections.usable_views"} <= imported[JUMPS]
