@@ -25,7 +25,7 @@ from recon.methods import BASELINE, DEFAULT, names
 
 @click.command(
     cls=Grouped,
-    first=("methods", "truth", "views", "rows", "binning", "axis", "seconds", "steps", "iterations", "output", "dry"),
+    first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output", "dry"),
 )
 @heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))

@@ -41,7 +41,6 @@ def listed(value: str) -> tuple[str, ...]:
         "views",
         "rows",
         "binning",
-        "axis",
         "output",
         "dry",
     ),

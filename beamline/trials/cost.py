@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 from beamline.trials.trial import Trial
@@ -28,8 +29,9 @@ _SMALL = 48, 160, 16  # views, columns and rows of the sweep that is measured
 def sweep_seconds(geometry: Geometry, now: Callable[[], float]) -> float:
     """s of a projection of all views and its adjoint, from a small one through the same beam."""
     extent = Extent(geometry, [1])
-    views, cols, rows = min(geometry.n_views, _SMALL[0]), min(extent.cols, _SMALL[1]), _SMALL[2]
-    small, lines = sample(extent, views, cols, min(geometry.detector_shape[0], rows))
+    rows = min(geometry.detector_shape[0], _SMALL[2])
+    cols = min(extent.cols, round(_SMALL[1] * math.sqrt(_SMALL[2] / rows)))  # as many voxels where rows are few
+    small, lines = sample(extent, min(geometry.n_views, _SMALL[0]), cols, rows)
     projector = Projector(small, Grid.matching(small))
     times = []
     for _ in range(3):  # the first one loads kernels
