@@ -104,6 +104,10 @@ class R2:
         """The fit that competes with methods on voxels: it is made, whatever they predict."""
         return replace(self, steps=self.planned_steps) if self.by_content else self
 
+    def for_trial(self, share: float) -> Self:
+        """The fit alone, of this share of the rows."""
+        return replace(self.as_candidate().for_part(share, 1.0), finish=0)
+
     @property
     def finish_sweeps(self) -> int:
         return SWEEPS if self.finish is None else self.finish
