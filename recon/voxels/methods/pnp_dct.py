@@ -122,6 +122,7 @@ def choose_patches(
         found = preferred_strength(partial(residuals_of_patches, judge, smooth), first, alike_of(problem))
         if found is None:
             return [first, 0]
+        judge.keep("patches", found)
         if is_coarse(problem.projector.geometry, problem.projector.grid):
             return [found.strength, 0]
         return [found.strength, simplest([judge.of_weight(weight), found.residuals])]
