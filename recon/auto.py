@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -54,30 +53,32 @@ class Auto:
             ValueError: no candidate takes these views or data.
         """
         decide = control.decide or Decisions(problem.seed)
-        at, because, decided = decide("method", lambda: self.choose(problem, control))
-        decide.preset(decided)
+        at, because, tried = decide("method", lambda: self.choose(problem, control))
         chosen = self.candidates[at]
-        if decided and isinstance(chosen, ChoosingMethod):  # its rivals were tried
+        if tried and isinstance(chosen, ChoosingMethod):  # with its rivals
             chosen = chosen.as_candidate()
         device = problem.device if chosen.traits.device else "cpu"
         found = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
         return replace(found, settings=settings, method=chosen.name)
 
-    def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str, Mapping[str, Sequence[Any]]]:
-        """Number of the chosen method, the reason, and the decisions on its prior."""
+    def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str, bool]:
+        """Number of the chosen method, the reason, and whether there were trials.
+
+        The prior that they found is not that of the whole: from fewer views and rows it costs 0.4 dB on a walnut.
+        """
         last = len(self.candidates) - 1
         wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
         if wider and is_wider(problem):
             name = self.candidates[wider[0]].name
-            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it", {}
+            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it", False
         part, where = part_of(problem)
         if part is None:
-            return last, where, {}
-        at, residuals, decided = predicts_best(part, self.candidates, control)
+            return last, where, False
+        at, residuals = predicts_best(part, self.candidates, control)
         if at is None:
-            return last, residuals, {}
-        return at, f"residual of views held out, {where}: {residuals}", decided
+            return last, residuals, False
+        return at, f"residual of views held out, {where}: {residuals}", True
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))

@@ -110,7 +110,7 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
         return RunTime(seconds, seconds)
     first = Extent(extent.geometry, [min(32, max(extent.heights))])
     parts = [run_seconds(_candidate(one), first, now) for one in candidates]
-    parts.append(run_seconds(_candidate(candidates[-1]), replace(extent, decided=True), now))
+    parts.append(run_seconds(_candidate(candidates[-1]), extent, now))
     return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -31,12 +31,10 @@ class TrialVerdict(NamedTuple):
     Attributes:
         best: number of the method to take; None: the trials ended before two were done.
         reason: all residuals in words.
-        decided: decisions on the prior, which hold for a run on all views, too.
     """
 
     best: int | None
     reason: str
-    decided: Mapping[str, Sequence[Any]]
 
 
 def predicts_best(
@@ -86,11 +84,11 @@ def predicts_best(
     listed = "; ".join(f"{methods[at].name} {residuals[at].mean():.4g}" for at in tried)
     if len(tried) + len(refused) < len(methods):
         if len(tried) < 2:
-            return TrialVerdict(None, "stopped before the choice", {})
+            return TrialVerdict(None, "stopped before the choice")
         listed += "; the others not tried in time"
     if not tried:
         raise ValueError("; ".join(refused))
-    return TrialVerdict(tried[simplest([residuals[at] for at in tried])], listed, decided)
+    return TrialVerdict(tried[simplest([residuals[at] for at in tried])], listed)
 
 
 def _candidate(method: Method) -> Method:

@@ -200,7 +200,7 @@ def _chosen(
     trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
     liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
     order = [liked.index(c) for c in tried]
-    at, residuals, _ = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
+    at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
     if at is None:
         return plan.preferred(plan.choices()), f"{expected}too little time"
     return plan.choices(name=liked[at].method)[0], f"residual of views held out, {where}: {residuals}"

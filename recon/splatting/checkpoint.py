@@ -92,7 +92,7 @@ def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None 
 
 def decisions_of(made: Mapping[str, Sequence[Any]], names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The first decisions of these names, numbers or lists of numbers, as arrays of a checkpoint."""
-    return {_DECIDED + name: np.array(made[name][0], np.float64) for name in names if made.get(name)}
+    return {_DECIDED + name: np.array(made[name][0]) for name in names if made.get(name)}
 
 
 def decisions_from(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:

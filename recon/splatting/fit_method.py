@@ -48,11 +48,8 @@ class FitMethod(Method, Protocol):
     def by_content(self) -> bool:
         """Views held out tell whether the fit pays, see `finish.best_candidate`."""
 
-    def as_candidate(self) -> Self:
-        """The method whose fit is made, whatever voxels predict."""
-
-    def fit_alone(self, gaussians: int | None) -> Self:
-        """The candidate from so many Gaussians, without a finish; None: as many as it takes by default."""
+    def for_trial(self, share: float) -> Self:
+        """The fit alone, of this share of the rows."""
 
     @property
     def least_steps(self) -> int | None:

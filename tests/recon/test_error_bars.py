@@ -12,7 +12,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.error_bars import _of_run, alternating, error_bars, error_bars_memory
+from recon.error_bars import alternating, error_bars, error_bars_memory
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 
@@ -128,11 +128,3 @@ def test_a_method_without_calibration_and_too_few_views_are_refused() -> None:
 def test_its_memory_is_at_least_its_arrays() -> None:
     for method in (recon.Fbp(), recon.FistaTv(), recon.R2()):
         assert error_bars_memory(method, VIEWS, GRID) > 4 * (2 * problem().projections.size + 4 * ball().size)
-
-
-def test_refits_follow_the_attempt_that_a_finish_took() -> None:
-    """Each attempt has units and a weight of its own."""
-    decided = {"units": [(1, 1, 0), (1, 2, 0)], "weight": [[0.25], [0.125]], "other": [True]}
-    assert _of_run(decided, 4) == {"units": [(1, 2, 0)], "weight": [[0.125]]}
-    first = _of_run(decided | {"other": [False]}, 4)
-    assert (first["units"][0], first["weight"][0]) == ((1, 1, 0), [0.25])

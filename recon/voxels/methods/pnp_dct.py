@@ -13,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out import CHOICE_SWEEPS, HeldOutTrial, is_coarse, preferred_strength, simplest
+from recon.voxels.held_out import CHOICE_SWEEPS, HeldOutTrial, alike_of, is_coarse, preferred_strength, simplest
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
@@ -119,11 +119,11 @@ def choose_patches(
         if judge is None or isinstance(weight, NoiseBalance):
             return [first, 0]
         smooth = judge.with_weight(weight)
-        found = preferred_strength(partial(residuals_of_patches, judge, smooth), first)
+        found = preferred_strength(partial(residuals_of_patches, judge, smooth), first, alike_of(problem))
         if found is None:
             return [first, 0]
-        projector = problem.projector
-        if is_coarse(projector.geometry, projector.grid):
+        judge.keep("patches", found)
+        if is_coarse(problem.projector.geometry, problem.projector.grid):
             return [found.strength, 0]
         return [found.strength, simplest([judge.of_weight(weight), found.residuals])]
 

@@ -152,11 +152,12 @@ def test_neither_the_unit_nor_what_views_share_changes_the_choice(
     assert simplest(list(unit * (residuals + shared))) == at
 
 
-@pytest.mark.parametrize("best", [-5, -1, 0, 1, 2, 7])
-def test_the_strength_of_the_least_residual_is_found_to_an_octave(best: int) -> None:
-    found = preferred_strength(lambda strength: 1 + abs(math.log2(strength / 3) - best) + SCATTER, 3.0)
-    assert found is not None and found.strength == 3.0 * 2.0**best
-    np.testing.assert_allclose(found.residuals, 1 + SCATTER)
+@pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])
+def test_the_strength_of_the_least_residual_is_found(best: float) -> None:
+    """A residual that is a parabola of the octave has its vertex where a parabola through three points has it."""
+    found = preferred_strength(lambda strength: 1 + (math.log2(strength / 3) - best) ** 2 + SCATTER, 3.0)
+    assert found is not None and found.strength == pytest.approx(3.0 * 2.0**best)
+    np.testing.assert_allclose(found.residuals, 1 + (round(best) - best) ** 2 + SCATTER)
 
 
 def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones() -> None:
@@ -169,7 +170,7 @@ def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones(
         return mean + SCATTER + 0.01 * octave * by_view
 
     found = preferred_strength(residuals, 3.0)
-    assert found is not None and found.strength == 3 * 32
+    assert found is not None and found.strength == pytest.approx(3 * 32)
 
 
 def test_trials_that_were_ended_prefer_nothing() -> None:
