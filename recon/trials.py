@@ -25,7 +25,7 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # share of the largest line integrals
 
 
-class TrialVerdict(NamedTuple):
+class TrialsVerdict(NamedTuple):
     """What trials tell.
 
     Attributes:
@@ -39,7 +39,7 @@ class TrialVerdict(NamedTuple):
 
 def predicts_best(
     part: ReconProblem, methods: Sequence[Method], control: RunControl, order: Sequence[int] | None = None
-) -> TrialVerdict:
+) -> TrialsVerdict:
     """Which of the methods predicts unseen views best (one of eight is held out): `held_out.simplest` of them.
 
     A prior that one trial chooses by views held out is that of the next ones. A method that `control` cuts short is not
@@ -84,11 +84,11 @@ def predicts_best(
     listed = "; ".join(f"{methods[at].name} {residuals[at].mean():.4g}" for at in tried)
     if len(tried) + len(refused) < len(methods):
         if len(tried) < 2:
-            return TrialVerdict(None, "stopped before the choice")
+            return TrialsVerdict(None, "stopped before the choice")
         listed += "; the others not tried in time"
     if not tried:
         raise ValueError("; ".join(refused))
-    return TrialVerdict(tried[simplest([residuals[at] for at in tried])], listed)
+    return TrialsVerdict(tried[simplest([residuals[at] for at in tried])], listed)
 
 
 def _candidate(method: Method) -> Method:

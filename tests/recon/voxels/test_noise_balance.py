@@ -79,8 +79,11 @@ def test_a_slow_method_is_looked_at_later() -> None:
     assert balance.after_sweep(_residual(1.0)) == pytest.approx(1.0, rel=0.05)
 
 
-def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(rng: np.random.Generator) -> None:
-    """OS-SIRT-TV was 5.9 dB below FISTA-TV on a slice of bone."""
+def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the weight by the noise; OS-SIRT-TV was 5.9 dB below FISTA-TV on a slice of bone."""
+    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
     n, views = 160, 50
     y, x = np.mgrid[: 2 * n, : 2 * n] - (n - 0.5)
     off = np.hypot(x, y)
