@@ -28,6 +28,7 @@ REMEDY = (
     "`beamline recon` takes it off where there is air beside the sample (--air auto); flats before and after the views "
     "(scan.flats.at: both) tell it, too."
 )
+TAKEN_OFF = "`beamline recon` takes it off where there is air beside the sample (--air auto)."
 GONE = 0.5  # share of the limit below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual light
@@ -78,8 +79,10 @@ class LightOverScan:
         first = mean if self.views < LASTS else self.first
         return LightOverScan(self.views + 1, first, recent, least, most, (self.rows[0] if self.views else row, row))
 
-    def said(self, limit: float) -> str:
-        """The drift over the scan in words; "" where it is within the limit, a fraction of the light."""
+    def said(self, limit: float, integrals: bool) -> str:
+        """The drift over the scan in words, of light or of `integrals`; "" where it is within the limit, a fraction of
+        the light.
+        """
         if self.views < 2 * LASTS:
             return ""
         change = math.expm1(self.first - sum(self.recent) / LASTS)
@@ -87,6 +90,9 @@ class LightOverScan:
         if max(abs(change), between) <= limit:
             return ""
         rows = f"frames {self.rows[0]} ... {self.rows[1]}, where there is air"
+        if integrals:
+            risen = sum(self.recent) / LASTS - self.first
+            return f"Line integrals of air change by {risen:+.3g} over the scan ({rows}). {TAKEN_OFF}"
         way = f"{'fell' if change < 0 else 'rose'} by {abs(change):.1%} over the scan ({rows})"
         if between > abs(change) + limit:
             way += f"; {between:.1%} lie between its least and its most"
@@ -120,9 +126,10 @@ class BeamCheck:
         if context.view is None or context.grid is None:
             return Look(state)
         state, flag = self._dip(state, frame.index, context.change, _whole(context.view, context.grid))
-        if flag is not None or not context.grid.flats or state.dipping:
-            return Look(state, flag)
-        return self._drift(state, frame.index, brightest_place(context.view, context.grid), in_air(context))
+        if flag is None and context.grid.flats and not state.dipping:
+            looked = self._drift(state, frame.index, brightest_place(context.view, context.grid), in_air(context))
+            state, flag = looked.state, looked.flag
+        return Look(state, flag if flag is None or not context.integrals else _of_integrals(flag))
 
     def _flat(self, row: int, score: float) -> Flag | None:
         if abs(score) <= self.drift:
@@ -182,6 +189,16 @@ def in_air(context: ScanContext) -> float:
         return math.nan
     brightest = brightest_place(context.view, context.grid)
     return brightest if brightest <= COVERED or abs(brightest - context.dimmer) <= DRIFT_STEP else math.nan
+
+
+def _of_integrals(flag: Flag) -> Flag:
+    """The flag of a file without counts and flats, where nobody knows the light."""
+    off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
+    if flag.limit == COVERED:
+        advice = f"No line integral of the frame is below {off:.3g}: the sample covers all of it, or air is not at 0."
+    else:
+        advice = f"Line integrals are {off:+.3g} off, beside 0 in air or beside the views before. {TAKEN_OFF}"
+    return replace(flag, advice=advice)
 
 
 def _size(score: float) -> str:

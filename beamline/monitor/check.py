@@ -48,6 +48,7 @@ class ScanContext:
         stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
+        integrals: frames were line integrals, and are judged as counts of a beam without flats of its own.
         model: line integrals of a volume at an angle in radians, float32 [row, col] means of cells of so many pixels a
             side. None where no volume is known.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
@@ -76,6 +77,7 @@ class ScanContext:
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
+    integrals: bool = False
     model: Callable[[float, int], CellValues] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None

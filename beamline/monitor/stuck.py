@@ -1,7 +1,4 @@
-"""Stuck: the same image twice. Noise never repeats, so an equal checksum is a frame that was delivered again.
-
-A dark or flat of a single grey value has no noise. Such frames are simulated, and what follows may repeat, too.
-"""
+"""Stuck: the same image twice. Noise never repeats, so an equal checksum is a frame that was delivered again."""
 
 from __future__ import annotations
 
@@ -15,11 +12,10 @@ from drivers.base.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class StuckState:
-    """`checksum` of the frame before; `repeats`: how many frames in a row have had it; `noiseless`: the camera is."""
+    """`checksum` of the frame before; `repeats`: how many frames in a row have had it."""
 
     checksum: int | None = None
     repeats: int = 0
-    noiseless: bool = False
 
 
 @dataclass(frozen=True)
@@ -35,10 +31,10 @@ class StuckCheck:
     start = StuckState
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
-        """Compare checksums."""
+        """Compare checksums. Darks and flats of a single grey value (simulated, without noise) are not compared."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
-        if plain or state.noiseless or digest.checksum != state.checksum:
-            return Look(StuckState(digest.checksum, noiseless=plain or state.noiseless))
+        if digest.checksum != state.checksum or plain:
+            return Look(replace(state, checksum=digest.checksum, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
             f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "

@@ -224,7 +224,7 @@ def context_of(source: ScanSource) -> ScanContext:
     if source.quantity != "line_integrals":
         return context
     preview = digest(np.zeros(source.shape, np.uint16), preview_bin=check_block(source.shape)).preview
-    return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0)
+    return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0, integrals=True)
 
 
 def _step(source: ScanSource) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
 
@@ -225,18 +225,14 @@ def passes_by_halves(
     kept = rng.binomial(counts.astype(np.int64), 0.5).astype(np.float32)
     if not kept.any():
         return None
-    half = replace(
-        emission,
-        survival=np.full_like(counts, 0.5) if emission.survival is None else emission.survival * np.float32(0.5),
-        background=None if emission.background is None else emission.background * np.float32(0.5),
-    )
-    survival, other = half.survival, counts - kept
-    assert survival is not None
-    if half.background is not None:
-        other -= half.background
+    share = np.float32(0.5)
+    survival = np.full_like(counts, share) if emission.survival is None else emission.survival * share
+    background = None if emission.background is None else emission.background * share
+    half = Emission(kept, emission.geometry, survival, background)
+    other = counts - kept if background is None else counts - kept - background
     lines = np.divide(other, survival, out=np.zeros_like(other), where=survival > 0)
     whole, least, best = Projector(emission.geometry, grid), math.inf, 0
-    for n, done in enumerate(islice(_passes(replace(half, counts=kept), grid, subsets), most), start=1):
+    for n, done in enumerate(islice(_passes(half, grid, subsets), most), start=1):
         missed = np.where(survival > 0, lines - whole.forward(done.activity), np.float32(0))
         error = _error_of_images(missed)
         if error >= least:

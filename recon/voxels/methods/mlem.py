@@ -88,10 +88,11 @@ def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subset
         return not go_on(history[-1])
 
     emission, most = _emission(problem), max(1, UPDATES // subsets)
-    iterations = most if method.iterations is None else method.iterations
-    if method.iterations is None and problem.use.emission is not None:
+    chosen = method.iterations
+    if chosen is None and problem.use.emission is not None:
         rng = np.random.default_rng(problem.seed)
-        iterations = passes_by_halves(emission, problem.grid, subsets, most, rng, tried) or most
+        chosen = passes_by_halves(emission, problem.grid, subsets, most, rng, tried)
+    iterations = most if chosen is None else chosen
     volume = mlem(emission, problem.grid, iterations, subsets, report)
     settings = {f.name: getattr(method, f.name) for f in fields(method)}
     return Reconstruction(volume, settings | {"iterations": iterations}, tuple(history))

@@ -35,15 +35,6 @@ def test_darks_without_noise_are_all_equal_and_say_nothing(fake: Any) -> None:
     assert only(fake.flags(darks)) == []
 
 
-def test_views_after_darks_without_noise_may_repeat(fake: Any) -> None:
-    """Views of a round sample in a simulation without noise."""
-    darks = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
-    views = fake.views(4)
-    same = [replace(frame, counts=views[0].counts.copy()) for frame in views]
-    assert only(fake.flags(darks + same)) == []
-    assert len(only(fake.flags(fake.references() + same))) == 3
-
-
 def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
     references = fake.references()
     views = [replace(frame, counts=np.full_like(frame.counts, 5000)) for frame in fake.views(4)]

@@ -90,6 +90,14 @@ def test_line_integrals_are_judged_as_counts_of_a_beam() -> None:
     assert 0 not in np.flatnonzero(found.flagged)
 
 
+def test_nothing_is_said_of_light_where_there_are_line_integrals_alone() -> None:
+    source = ArraySource(SCAN.line_integrals().astype(np.float32) + np.float32(0.1), [0] * 30, SCAN.angles)
+    source.quantity = "line_integrals"
+    advice = [flag.advice for each in replay(source) for flag in each.flags if flag.check == "beam"]  # type: ignore[arg-type]
+    assert advice and "+0.1 off" in advice[0]
+    assert not any("light" in text or "flats" in text for text in advice)
+
+
 @pytest.mark.parametrize(("level", "expected"), [(4095, 4095.0), (4000, 65535.0), (65535, 65535.0)])
 def test_the_end_of_the_range_is_where_pixels_pile_up(level: int, expected: float) -> None:
     data = np.full((4, *SCAN.shape), level, np.uint16)
