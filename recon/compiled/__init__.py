@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from recon.compiled.archive import archive_of, unpack
-from recon.compiled.level import CpuLevel, level_for, processor_flags
+from recon.compiled.level import ProcessorLevel, level_for, processor_flags
 
 ROOT = Path(__file__).parents[2]
 """The folder of the packages `beamline`, `recon` and `simulators`."""
@@ -34,4 +34,4 @@ def use_compiled_kernels() -> None:
         unpack(archive_of(sys.version_info[:2]), ROOT)
 
 
-__all__ = ["ROOT", "CpuLevel", "use_compiled_kernels"]
+__all__ = ["ROOT", "ProcessorLevel", "use_compiled_kernels"]

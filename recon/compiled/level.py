@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class CpuLevel:
+class ProcessorLevel:
     """Instructions of a level of the x86-64 psABI.
 
     Attributes:
@@ -30,23 +30,23 @@ class CpuLevel:
 
 
 _V3 = "+avx,+avx2,+bmi,+bmi2,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sse4.1,+sse4.2,+xsave"
-V3 = CpuLevel(
+V3 = ProcessorLevel(
     "x86-64-v3",
     frozenset({"abm", "avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe", "popcnt", "sse4_1", "sse4_2", "xsave"}),
     _V3,
 )
-V4 = CpuLevel(
+V4 = ProcessorLevel(
     "x86-64-v4",
     V3.flags | {"avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl"},
     _V3 + ",+avx512bw,+avx512cd,+avx512dq,+avx512f,+avx512vl,-prefer-256-bit",
 )
-BASELINE = CpuLevel("x86-64", frozenset(), "")
+BASELINE = ProcessorLevel("x86-64", frozenset(), "")
 """Every processor of x86-64; nothing is carried for it."""
 LEVELS = (V4, V3)
 """The highest first."""
 
 
-def level_for(environment: Mapping[str, str], flags: Set[str]) -> CpuLevel | None:
+def level_for(environment: Mapping[str, str], flags: Set[str]) -> ProcessorLevel | None:
     """The highest level whose instructions the processor has; None below v3, or where the user names a processor.
 
     A level that the environment names already is kept. A job on another node may inherit one that its processor lacks:

@@ -27,11 +27,15 @@ from unittest.mock import patch
 
 import h5py
 import llvmlite.binding
-import numba
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+
+import recon  # noqa: F401 - before numba: it says what processor numba compiles for
+
+# isort: split
+import numba
 
 from beamline.cli.main import main
 from tests.conftest import SHARED_DATA
@@ -108,9 +112,11 @@ def environment() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Its name, and a digest of its instructions: machines of several generations call themselves "AMD EPYC"."""
+    """Its name, a digest of its instructions (machines of several generations call themselves "AMD EPYC"), and the
+    level that numba compiles for."""
     instructions = hashlib.sha256(llvmlite.binding.get_host_cpu_features().flatten().encode()).hexdigest()[:8]
-    return f"{platform.system()} {platform.machine()} {llvmlite.binding.get_host_cpu_name()} {instructions}"
+    name, level = llvmlite.binding.get_host_cpu_name(), numba.config.CPU_NAME or "itself"
+    return f"{platform.system()} {platform.machine()} {name} {instructions}, compiled for {level}"
 
 
 def digests(case: str, folder: Path) -> dict[str, str]:
