@@ -75,8 +75,28 @@ def groups_taken(source: ScanSource) -> ReferenceGroups:
     return ReferenceGroups(groups_of(source, FrameKind.DARK), groups_of(source, FrameKind.FLAT), ())
 
 
+# The groups of a scan, which several rules and the correction of its views ask for, and what they depend on.
+_last: WeakKeyDictionary[ScanSource, tuple[tuple[object, ...], ReferenceGroups]] = WeakKeyDictionary()
+
+
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
-    """The references of a scan of counts, judged frame by frame and as groups; flats beside those of their part."""
+    """The references of a scan of counts, judged frame by frame and as groups; flats beside those of their part.
+
+    They are judged once, until the scan grows or another of its frames turns out to be unreadable.
+    """
+    last = _last.get(source)
+    if last is None or last[0] != _depends_on(source, limits):
+        groups = _judged(source, limits)
+        _last[source] = last = _depends_on(source, limits), groups  # with the unreadable frames that it came across
+    return last[1]
+
+
+def _depends_on(source: ScanSource, limits: ReferenceLimits | None) -> tuple[object, ...]:
+    rows = (source.image_key, source.exposures, source.angles, source.part_starts)
+    return limits, *(values.tobytes() for values in rows), tuple(source.unreadable)
+
+
+def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGroups:
     taken = groups_taken(source)
     groups = [_readable(source, group) for group in (*taken.darks, *taken.flats)]
     left, odd = without_odd(groups, limits, views := _views_beside(source, taken.flats))

@@ -72,10 +72,10 @@ def _assert_frames(path: Path, one_part: bool = True) -> int:
 def _killed(folder: Path, moments: Sequence[float], step: bool) -> list[Path]:
     """The folders of runs of a scan as kills leave them, where there is one yet.
 
-    A moment is the number of a frame, and for how much of a frame's time it has been there; they rise. Beyond the last
+    A moment is the number of a frame, with a share of the time to the next one; they rise. Beyond the last
     frame the file is closed.
     """
-    runs, left, taken = folder / "runs", list[Path](), 0
+    runs, folders, taken = folder / "runs", list[Path](), 0
     ours, theirs = multiprocessing.Pipe(duplex=False)
     process = multiprocessing.get_context("fork").Process(target=_scan, args=(runs, step, theirs))
     process.start()
@@ -92,13 +92,13 @@ def _killed(folder: Path, moments: Sequence[float], step: bool) -> list[Path]:
         if k == len(moments) - 1:
             process.kill()
         if runs.exists():
-            left += shutil.copytree(runs, folder / str(k)).iterdir()
+            folders += shutil.copytree(runs, folder / str(k)).iterdir()
         os.kill(process.pid, signal.SIGCONT)
     process.join()
     ours.close()
     for file in folder.rglob("*"):
         os.utime(file, (time.time() - 2 * QUIET,) * 2)
-    return left
+    return folders
 
 
 def kills(folder: Path, n: int, scans: int, seed: int, steps: Sequence[bool]) -> dict[str, int]:
