@@ -120,8 +120,8 @@ print(len(compiled))
     plain = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
 
     def compiled() -> int:
-        environment = plain | {"PYTHONPATH": str(tmp_path)}
-        done = subprocess.run([sys.executable, "-c", run], env=environment, capture_output=True, text=True, check=True)
+        words, environment = [sys.executable, "-c", run], plain | {"PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(words, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
         return int(done.stdout)
 
     assert compiled() == 0
