@@ -213,8 +213,7 @@ def trials(done: TrialReached, what: str = "trials") -> str:
 def fit(at: FitReached) -> str:
     """n/N, rate, views, Gaussians (iterations have none), residuals and time left."""
     word = at.unit or ("steps" if at.n_gaussians else "iterations")
-    of = f"{at.least_steps} to {at.steps}" if at.least_steps else at.steps
-    parts = [f"{at.step}/{of} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
+    parts = [f"{at.step}/{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
     parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
     parts += [f"{at.n_views} views"]
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
@@ -223,8 +222,7 @@ def fit(at: FitReached) -> str:
     if at.held_out is not None and math.isfinite(at.held_out):
         parts.append(f"held out {at.held_out:.4f}")
     if at.eta_s is not None:
-        early = f"{_clock_time((at.least_steps - at.step) / at.per_s)} to " if at.least_steps and at.per_s else ""
-        parts.append(f"{early}{_clock_time(at.eta_s)} left")
+        parts.append(f"{_clock_time(at.eta_s)} left")
     return ", ".join(parts)
 
 

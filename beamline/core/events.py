@@ -352,8 +352,7 @@ class KernelsCompiled(Event, event="progress"):
 
 
 class FitReached(Event, event="progress"):
-    """Where a fit or iterations stand; the fields are those of `recon.base.method.Progress`, a rate and a time left
-    (of all `steps`, which the data may end after `least_steps`).
+    """Where a fit or iterations stand; the fields are those of `recon.base.method.Progress`, a rate and a time left.
 
     Numbers of another process are None where they are not finite.
     """
@@ -370,7 +369,6 @@ class FitReached(Event, event="progress"):
     unit: str
     per_s: float | None
     eta_s: float | None
-    least_steps: int = 0
 
 
 class ScanDone(Event, event="scan_done"):

@@ -244,8 +244,6 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
         share = progress.step / progress.steps if progress.steps else 0.0
         at = done + round((slab.own.stop - slab.own.start) * share)
         reached = max(reached, at)  # a fit's finish counts from the beginning
-        listen(
-            replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices", least_steps=0)
-        )
+        listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
 
     return watch

@@ -14,7 +14,7 @@ from recon.assess.time_model import NextDecibel, duration_text, next_decibel, ne
 from recon.base.method import Progress, Reconstruction
 from recon.splatting.settings import FitSettings
 
-_FIELDS = {f.name: f.type for f in fields(Progress) if f.name not in ("unit", "least_steps")}  # figures
+_FIELDS = {f.name: f.type for f in fields(Progress) if f.name != "unit"}  # figures
 _WORDS = {"held_out": "views held out", "residual": "views used"}
 
 

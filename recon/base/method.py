@@ -40,8 +40,7 @@ class Progress:
         n_gaussians, n_views: in the model and in the data.
         held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN without such views.
         unit: name of the steps of a direct method or of a part of the work, such as slices; loss and residual are then
-        NaN.
-        least_steps: after which the data may end it, before `steps`; 0: they cannot.
+            NaN.
     """
 
     step: int
@@ -53,7 +52,6 @@ class Progress:
     n_views: int
     held_out: float = float("nan")
     unit: str = ""
-    least_steps: int = 0
 
 
 @dataclass(frozen=True, eq=False)
