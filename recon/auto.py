@@ -58,9 +58,9 @@ class Auto:
         if tried and isinstance(chosen, ChoosingMethod):  # with its rivals
             chosen = chosen.as_candidate()
         device = problem.device if chosen.traits.device else "cpu"
-        found = chosen.run(replace(problem, device=device), replace(control, decide=decide))
-        settings = {**found.settings, "chosen_method": chosen.name, "chosen_because": because}
-        return replace(found, settings=settings, method=chosen.name)
+        result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
+        settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": because}
+        return replace(result, settings=settings, method=chosen.name)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str, bool]:
         """Number of the chosen method, the reason, and whether there were trials.

@@ -139,10 +139,10 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
     """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
     some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
-    found = middle_of_cone(problem.geometry, problem.grid, some, height)
-    if found is None:
+    middle = middle_of_cone(problem.geometry, problem.grid, some, height)
+    if middle is None:
         return None
-    rows, views, box = found
+    rows, views, box = middle
     return _of_rows(problem, rows, views, box)
 
 
@@ -167,10 +167,10 @@ def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
 
 def _residuals(volume: Volume, problem: ReconProblem) -> F64:
     """Median deviation [view] of the views from those of a volume, negative values at zero, on rays with matter."""
-    left = problem.projections - Projector(problem.geometry, volume.grid).forward(np.maximum(volume.data, 0))
+    differences = problem.projections - Projector(problem.geometry, volume.grid).forward(np.maximum(volume.data, 0))
     if problem.use.weights is not None:
-        left[problem.use.weights == 0] = np.nan
+        differences[problem.use.weights == 0] = np.nan
     matter = problem.projections > _MATTER * np.nanpercentile(problem.projections, 99)
-    seen = np.where(matter, left, np.nan) if matter.any() else left
-    found = np.array([median_deviation(view) for view in seen if np.isfinite(view).any()])
-    return found if found.size else np.full(1, np.inf)
+    seen = np.where(matter, differences, np.nan) if matter.any() else differences
+    deviations = np.array([median_deviation(view) for view in seen if np.isfinite(view).any()])
+    return deviations if deviations.size else np.full(1, np.inf)

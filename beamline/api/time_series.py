@@ -12,7 +12,7 @@ from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.time_series import TimeSeriesResult, WantedSeries
+from beamline.reconstruct.time_series import SeriesRequest, TimeSeriesResult
 from beamline.reconstruct.time_series import reconstruct_series as fitted_series
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
@@ -58,7 +58,7 @@ def reconstruct_series(
         options = ReconOptions(source, target, wanted, command=command)
         result = fitted_series(
             options,
-            WantedSeries(volumes, moves),
+            SeriesRequest(volumes, moves),
             sink,
             clock,
             lambda stage: lambda n, of: None,

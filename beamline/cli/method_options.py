@@ -122,17 +122,17 @@ def _of_kind(method: type[Method], path: str, value: Any) -> Any:
     """The value of a setting, if it has the kind of the method's default; None leaves the choice to the method."""
     if not has_setting(method, path):
         return value  # `build` names the methods that have the setting
-    own: Any = method()
+    default: Any = method()
     for name in path.split("."):
-        own = getattr(own, name)
-    if isinstance(own, tuple) and isinstance(value, list):
+        default = getattr(default, name)
+    if isinstance(default, tuple) and isinstance(value, list):
         return tuple(value)
-    numbers, given = isinstance(own, int | float), isinstance(value, int | float)
-    fits = isinstance(own, bool) == isinstance(value, bool) and numbers == given
-    if own is not None and (
-        not fits or dataclasses.is_dataclass(own) or isinstance(own, str) != isinstance(value, str)
+    numbers, given = isinstance(default, int | float), isinstance(value, int | float)
+    fits = isinstance(default, bool) == isinstance(value, bool) and numbers == given
+    if default is not None and (
+        not fits or dataclasses.is_dataclass(default) or isinstance(default, str) != isinstance(value, str)
     ):
-        raise ValueError(f"{path}={value!r} is not of the kind of {own!r}, the default")
+        raise ValueError(f"{path}={value!r} is not of the kind of {default!r}, the default")
     return value
 
 
@@ -187,8 +187,8 @@ _FINISH = option(
     owner=Owner("finish"),
     excludes={**_PLANNED, **_FINISHED},
     type=click.IntRange(min=0),
-    help="Sweeps on voxels after the fit, which bring back edges, cracks and pores. Default: 8, "
-    "or 16 or 24 where views held out are explained the better; 0: none.",
+    help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
+    "with sparse patches where views held out are predicted better so.",
 )
 _ITERATIONS = option(
     "--iterations",

@@ -203,15 +203,17 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
     Only --checkpoint may replace the file of --resume.
     """
     named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
-    for one, other in itertools.combinations(named, 2):
-        if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
-            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}. Give two different files.")
+    for first, second in itertools.combinations(named, 2):
+        if named[first] == named[second] and {first, second} != {"--checkpoint", "--resume"}:
+            raise click.UsageError(
+                f"{first} and {second} are the same file, {files[second]}. Give two different files."
+            )
 
 
 @contextmanager
-def json_events(wanted: bool) -> Iterator[Sink]:
-    """The sink for JSON on stdout, idle unless `wanted`. An error in the block becomes the event `failed`."""
-    if not wanted:
+def json_events(as_json: bool) -> Iterator[Sink]:
+    """The sink for JSON on stdout, idle unless `as_json`. An error in the block becomes the event `failed`."""
+    if not as_json:
         yield fan_out()
         return
     lines = JsonLines(sys.stdout)

@@ -221,14 +221,14 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
         click.echo("\n".join(needs.lines()))
 
 
-def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: bool) -> None:
+def _try_axes(options: ReconOptions, axes: AxisRange, path: Path, as_json: bool) -> None:
     """Write a picture of one slice by each of some axes."""
     from beamline.reconstruct.axis_trials import try_axes
 
     last: list[Event] = []
     with events_shown(as_json) as shown:
         sink, clock = fan_out(last.append, shown), SystemClock()
-        try_axes(options, wanted, path, sink, clock, counting("axes", sink, clock))
+        try_axes(options, axes, path, sink, clock, counting("axes", sink, clock))
     if not as_json:
         done = last[-1].data
         scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())

@@ -76,7 +76,7 @@ recon_options = together(
         "-m",
         "--method",
         type=click.Choice((AUTO, *names())),
-        help="auto chooses r2, fista-tv or fbp by how well it predicts views held out. r2 fits Gaussians to the views, "
+        help="auto chooses fbp, fista-tv, pnp-dct or r2 by views held out. r2 fits Gaussians to the views, "
         "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
         "options of the fit.",
     ),

@@ -57,7 +57,7 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
     # Imported here: help needs none of it.
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
-    from beamline.reconstruct.time_series import WantedSeries, reconstruct_series, series_needs
+    from beamline.reconstruct.time_series import SeriesRequest, reconstruct_series, series_needs
 
     source, selection = chosen(file, values["seed"], values)
     target = output or Path(f"{file.stem}_time.h5")
@@ -66,16 +66,16 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
         seed=values["seed"], unfinished=values["unfinished"], memory=values["memory"],
         command=repeating(context, file, target),
     )  # fmt: skip
-    clock, wanted, series = SystemClock(), WantedSeries(values["volumes"], values["moves"]), None
+    clock, request, series = SystemClock(), SeriesRequest(values["volumes"], values["moves"]), None
     with events_shown(values["as_json"]) as sink:
         if values["dry"]:
-            needs = series_needs(options, wanted, clock)
+            needs = series_needs(options, request, clock)
         else:
             series = reconstruct_series(
-                options, wanted, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)
+                options, request, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)
             )
         outcome: Any = needs if series is None else series
-        sink(Done(needs if series is None else series.told(), time=clock.now()))
+        sink(Done(needs if series is None else series.event_values(), time=clock.now()))
     if not values["as_json"]:
         click.echo("\n".join(outcome.lines()))
     if series is not None and series.ended_early:

@@ -57,15 +57,15 @@ class Event:
     @property
     def data(self) -> dict[str, Any]:
         """Its values by name, as a JSON line has them."""
-        found: dict[str, Any] = {}
-        own = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
-        for each in (*own, *(each for each in fields(Event) if each.name != "time")):
+        values: dict[str, Any] = {}
+        own_fields = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
+        for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):
             value = getattr(self, each.name)
             if _SPREAD in each.metadata:
-                found |= value if isinstance(value, Mapping) else each.metadata[_SPREAD](value)
+                values |= value if isinstance(value, Mapping) else each.metadata[_SPREAD](value)
             elif value is not each.default:
-                found[each.name] = value
-        return found
+                values[each.name] = value
+        return values
 
     def to_json(self) -> str:
         """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
@@ -131,13 +131,13 @@ def _types(event: str) -> Mapping[str, Sequence[Any]]:
     kinds = []
     for kind in KINDS.get(event, ()):
         spread = _spread_fields(kind)
-        own = _hints(kind, without=[each.name for each, _ in spread])
+        hints = _hints(kind, without=[each.name for each, _ in spread])
         for _, of in spread:
-            own |= _hints(of) if is_dataclass(of) else {}
-        kinds.append((own, any(not is_dataclass(of) for _, of in spread)))
-    names = {name for own, _ in kinds for name in own}
+            hints |= _hints(of) if is_dataclass(of) else {}
+        kinds.append((hints, any(not is_dataclass(of) for _, of in spread)))
+    names = {name for hints, _ in kinds for name in hints}
     # What has no field of its own is among what is spread.
-    return {name: [own.get(name, Any) for own, others in kinds if name in own or others] for name in names}
+    return {name: [hints.get(name, Any) for hints, others in kinds if name in hints or others] for name in names}
 
 
 def _hints(kind: Any, without: Sequence[str] = ()) -> dict[str, Any]:
@@ -272,7 +272,7 @@ class BeamRead(Event, event="beam"):
 class FrameFlagged(Event, event="flag"):
     """A check of the monitor begins to flag, or flags at another level."""
 
-    flag: Flag = _spread(Flag.told)
+    flag: Flag = _spread(Flag.event_values)
 
 
 class RuleBroken(Event, event="flag"):
@@ -374,7 +374,7 @@ class FitReached(Event, event="progress"):
 class ScanDone(Event, event="scan_done"):
     """The scan file is closed."""
 
-    result: RunResult = _spread(RunResult.of_file)
+    result: RunResult = _spread(RunResult.file_values)
 
 
 class ReconStarted(Event, event="recon_started"):
@@ -452,7 +452,7 @@ class RunDone(Event, event="done"):
     """A run has ended well. result: a `RunResult`; of a line of another process, its values by name."""
 
     folder: Path
-    result: Any = _spread(RunResult.of_run)
+    result: Any = _spread(RunResult.run_values)
 
 
 class Done(Listed, event="done"):
@@ -465,7 +465,7 @@ class VolumeDone(Event, event="done"):
     record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """
 
-    record: Any = _spread(lambda record: record.told())
+    record: Any = _spread(lambda record: record.event_values())
 
 
 class Failed(Event, event="failed"):

@@ -61,6 +61,6 @@ class Flag:
         boxes = np.rint(np.linspace(self.from_region, self.region, len(self.frames))).astype(int).tolist()
         return {frame: tuple(box) for frame, box in zip(self.frames, boxes, strict=True)}
 
-    def told(self) -> dict[str, Any]:
+    def event_values(self) -> dict[str, Any]:
         """What the event `flag` says, by name."""
         return {name: value for name, value in vars(self).items() if name != "from_region" or value is not None}

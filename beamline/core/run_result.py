@@ -69,11 +69,11 @@ class RunResult:
         """Whether the scan is complete, without a fault of frames, darks or flats."""
         return self.status == "complete" and not (self.missing or self.alarmed_frames or self.reference_faults)
 
-    def of_file(self) -> dict[str, Any]:
-        """What `scan_done` says: the file is closed."""
+    def file_values(self) -> dict[str, Any]:
+        """What the event `scan_done` says when the file is closed, by name."""
         without = ("sample",) if self.returned else ("sample", "returned")
         return {name: value for name, value in vars(self).items() if name not in without}
 
-    def of_run(self) -> dict[str, Any]:
-        """What the `done` of a run says, which has ended well."""
+    def run_values(self) -> dict[str, Any]:
+        """What the event `done` says of a run that has ended well, by name."""
         return {name: value for name, value in vars(self).items() if name not in ("sample", "status")}

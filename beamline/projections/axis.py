@@ -70,7 +70,7 @@ def _axis_by_views(
     coarse = replace(selection, binning=binning, rows=(first, first + height))
     poses, frames = poses_of(source, coarse, usable.frames), usable.frames
     if poses is not None:
-        frames = frames[poses.known(frames)]
+        frames = frames[poses.stated(frames)]
     views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
     geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])

@@ -242,7 +242,7 @@ class ScanCorrection:
         unlit = np.array([row for row in asked.tolist() if self._light.known.get(row) is False], np.int64)
         if (news := np.setdiff1d(unlit, sorted(self._told))).size == 0:
             return
-        gap = f", and{said}" if (said := gap_said(self._source, asked, lit)) else ""
+        gap = f", and{gap_text}" if (gap_text := gap_said(self._source, asked, lit)) else ""
         self._told.update(news.tolist())
         self._warn(
             f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "

@@ -64,10 +64,10 @@ class ViewFilters:
         """The views through all filters, in the rows that are wanted."""
         if not self.filters or not views.view_ids.size:
             return views
-        read, wanted = self._widened(rows)
+        read, kept = self._widened(rows)
         for each in self.filters:
             views = each.apply(views, read.start)
-        return replace(views, data=np.ascontiguousarray(views.data[:, wanted]), masked=views.masked[wanted])
+        return replace(views, data=np.ascontiguousarray(views.data[:, kept]), masked=views.masked[kept])
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
         """Detector rows to read, and which of them are wanted, in binned rows."""

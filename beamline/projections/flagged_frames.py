@@ -61,13 +61,13 @@ def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
     if source.quantity != "counts":
         return {}
     darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    wanted = {"dark": darks[:1], "flats": flats[:1], "last flats": flats[1:][-1:]}
+    shown = {"dark": darks[:1], "flats": flats[:1], "last flats": flats[1:][-1:]}
     images = {}
-    for title, groups in wanted.items():
+    for title, groups in shown.items():
         for group in groups:
             mean = np.mean([_small(source.read([row])[0]) for row in group[:4]], axis=0, dtype=np.float32)
             images[f"{title} (counts)"] = np.asarray(mean, np.float32)
-    if len(images) == len(wanted):
+    if len(images) == len(shown):
         dark, first, last = images.values()
         lit = first - dark > 0.1 * np.median(first - dark)
         images["last flats / first"] = np.where(lit, (last - dark) / np.where(lit, first - dark, 1), np.nan)
@@ -94,20 +94,20 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
     kind, replaces = FrameKind(int(source.image_key[row])).name.lower(), source.replaces
     if replaces is not None and (new := np.flatnonzero(replaces == row)).size:
         kind = f"replaced by {new[0]}"
-    said, regions, alarm = [], [], False
+    labels, regions, alarm = [], [], False
     for i, entry in enumerate(flags.legend):
         if not flags.bits[row] >> entry.bit & 1:
             continue
         is_alarm = bool(flags.bits[row] >> entry.alarm_bit & 1)
         alarm = alarm or is_alarm
-        known = flags.scores is not None and np.isfinite(flags.scores[row, i])
-        score = f" {flags.scores[row, i]:.3g}" if flags.scores is not None and known else ""
-        said.append(f"{entry.name} {Level.ALARM if is_alarm else Level.WARN}{score}")
+        has_score = flags.scores is not None and np.isfinite(flags.scores[row, i])
+        score = f" {flags.scores[row, i]:.3g}" if flags.scores is not None and has_score else ""
+        labels.append(f"{entry.name} {Level.ALARM if is_alarm else Level.WARN}{score}")
         if flags.regions is not None and flags.regions[row, i, 0] >= 0:
             top, bottom, left, right = flags.regions[row, i].tolist()
             regions.append((top, bottom, left, right))
     title = f"frame {row}, {kind}" + (f", {angle:.1f}°" if np.isfinite(angle) else "")
-    return FlaggedFrame(_small(source.read([row])[0]), source.shape, title, said, regions, alarm)
+    return FlaggedFrame(_small(source.read([row])[0]), source.shape, title, labels, regions, alarm)
 
 
 def _small(image: NDArray[np.generic]) -> NDArray[np.float32]:

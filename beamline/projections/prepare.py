@@ -15,7 +15,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.calibrate import Calibrate
-from beamline.projections.corrections.poses import ScanPoses, poses_of, require_known, stated_poses
+from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.emission import prepare_emission
 from beamline.projections.prepared import PreparedProjections
@@ -136,7 +136,7 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
-        require_known(poses, source, selection, usable.frames[first])
+        require_stated(poses, source, selection, usable.frames[first])
     return usable, poses
 
 
@@ -148,8 +148,8 @@ def _chosen(
     chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
-        require_known(poses, source, selection, used)
-        rest = rest[poses.known(rest)]
+        require_stated(poses, source, selection, used)
+        rest = rest[poses.stated(rest)]
     return used, spread(rest, _HELD_OUT_VIEWS)
 
 
@@ -189,12 +189,12 @@ def _after_scan_steps(
 def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
     """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
     table = stated_poses(source, selection)
-    known = None if table is None else table.axis_col
-    if known is None or selection.axis_col is not None or abs(known - axis_col) <= _SAME_AXIS:
+    poses_axis = None if table is None else table.axis_col
+    if poses_axis is None or selection.axis_col is not None or abs(poses_axis - axis_col) <= _SAME_AXIS:
         return
     warn(
-        f"The poses of {table} go with the rotation axis of that volume, column {known:.2f}; column {axis_col:.2f} is "
-        f"used. Give --axis {known:.2f} to have both."
+        f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
+        f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
     )
 
 
@@ -203,16 +203,16 @@ def _fill_unknown(prepared: PreparedProjections) -> None:
     data, geometry = prepared.projections.data, prepared.geometry
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
-        known = np.ones(geometry.detector_shape, np.float32)
+        weights = np.ones(geometry.detector_shape, np.float32)
         if prepared.measured is not None:
-            known *= prepared.measured
+            weights *= prepared.measured
         if prepared.shares_of is not None:
-            shares = prepared.shares_of(slice(view, view + 1), slice(0, len(known)))
-            known *= 1 if shares is None else shares[0]
+            shares = prepared.shares_of(slice(view, view + 1), slice(0, len(weights)))
+            weights *= 1 if shares is None else shares[0]
         if seen is not None:
-            known *= seen[view]
-        if not known.all():
-            data[view] = masked(data[view : view + 1], known[None])[0][0]
+            weights *= seen[view]
+        if not weights.all():
+            data[view] = masked(data[view : view + 1], weights[None])[0][0]
 
 
 def assemble(

@@ -45,14 +45,16 @@ def registered() -> tuple[type[PrepStep], ...]:
     taken = {option.name for step in ours for option in options_of(step).values()}
 
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
-        own = {option.name for option in options_of(step).values()}
+        names_of_options = {option.name for option in options_of(step).values()}
         if step.name != name or not isinstance(step(), ViewStep | PlaceStep | RayStep | ScanStep):
             raise ValueError(
                 f"{step.__name__} is no ViewStep, PlaceStep, RayStep or ScanStep of the entry point's name"
             )
-        if own & taken or not names.issuperset(step.follows):
-            raise ValueError(f"it has an option of another step ({own & taken}), or follows none of {sorted(names)}")
-        taken.update(own)
+        if names_of_options & taken or not names.issuperset(step.follows):
+            raise ValueError(
+                f"it has an option of another step ({names_of_options & taken}), or follows none of {sorted(names)}"
+            )
+        taken.update(names_of_options)
         return step
 
     return (*ours, *plugins("correction", names, fitting).values())
@@ -88,8 +90,8 @@ def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[st
     records: dict[str, Value] = {}
     for step in steps:
         did = done.get(step.name, StepDone())
-        said = {f"{step.name}_said": did.said} if did.said else {}
-        records |= _options(step) | said if did.parameters is None else did.parameters
+        sentence = {f"{step.name}_said": did.said} if did.said else {}
+        records |= _options(step) | sentence if did.parameters is None else did.parameters
     return records
 
 

@@ -33,7 +33,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     poses = poses_of(source, selection, frames)
     if poses is not None:
-        frames = frames[poses.known(frames)]
+        frames = frames[poses.stated(frames)]
     frames = frames[choose_views(source, frames, selection)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated

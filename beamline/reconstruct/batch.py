@@ -274,14 +274,14 @@ def _refuse_other(folder: Path, recipe: bytes) -> None:
         )
 
 
-def _rows(scans: Sequence[Path], known: Sequence[BatchRow]) -> list[BatchRow]:
-    """The rows known, and one for each scan that is new."""
-    old = {row.scan for row in known}
+def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
+    """The earlier rows, and one for each scan that is new."""
+    old = {row.scan for row in earlier}
     new = [path for path in scans if str(path.resolve()) not in old]
-    names = names_of([*(Path(row.scan) for row in known), *new])[len(known) :]
-    taken = {row.name.casefold() for row in known}
-    free = [f"{name}_{len(known) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
-    return [*known, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
+    names = names_of([*(Path(row.scan) for row in earlier), *new])[len(earlier) :]
+    taken = {row.name.casefold() for row in earlier}
+    free = [f"{name}_{len(earlier) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
+    return [*earlier, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
 
 
 def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> BatchRow:
@@ -317,8 +317,8 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
     finally:
         remove(work)
     residual = last.get("residual_held_out", last.get("residual"))
-    said = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
-    message = "" if state == "done" else said or f"no volume: its process ended with code {code}"
+    reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+    message = "" if state == "done" else reason or f"no volume: its process ended with code {code}"
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
         message=message,

@@ -114,11 +114,11 @@ class VolumeLooks:
         """Whether there is time for so many times the projection of all views."""
         return not self.waited_for and self.context.leaves(projections * self.all_rays)
 
-    def warn(self, said: str) -> None:
+    def warn(self, sentence: str) -> None:
         """Tell of a warning that is not empty, and keep it."""
-        if said:
-            self.sink(Warned(said, time=self.clock.now()))
-            self.warnings.append(said)
+        if sentence:
+            self.sink(Warned(sentence, time=self.clock.now()))
+            self.warnings.append(sentence)
 
     @property
     def stray_map(self) -> NDArray[np.float32] | None:
@@ -137,8 +137,8 @@ class VolumeLooks:
         """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
         grid, geometry = self.made.volume.grid, self.prepared.geometry
         is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
-        found = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
-        return {**found, "seconds": seconds}
+        figures = measure(volume, None if is_part else self.prepared, self.truth, self.context.phases.progress)
+        return {**figures, "seconds": seconds}
 
     def look_at_residual(self) -> None:
         """Measure the volume, and what it leaves in the views: of a volume that was fitted to them.
@@ -150,13 +150,13 @@ class VolumeLooks:
         if not self.direct:
             self.unexplained = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
         before = self.clock.now()
-        own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
+        figures = self.metrics[made.method] = self.measured(made.volume, made.seconds)
         share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
         self.all_rays = (self.clock.now() - before) / share
-        if not self.direct and "residual" in own:
-            self.warn(not_begun_warning(made, own["residual"], uniform_residual(made.volume.grid, prepared)))
+        if not self.direct and "residual" in figures:
+            self.warn(not_begun_warning(made, figures["residual"], uniform_residual(made.volume.grid, prepared)))
         if self.unexplained is not None:
-            own["unexplained"] = self.unexplained.share
+            figures["unexplained"] = self.unexplained.share
             self.hiding = hiding_warning(made, self.unexplained)
             self.warn(self.hiding)
 
@@ -225,8 +225,8 @@ class VolumeLooks:
             beside_fbp = compare(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
             if beside_fbp is None:
                 break  # it shows no air
-            self.warn(said := lost_mass_warning(self.made, beside_fbp))
-            lost = lost or bool(said)
+            self.warn(sentence := lost_mass_warning(self.made, beside_fbp))
+            lost = lost or bool(sentence)
         return lost
 
     def decide_whether_fbp_is_kept(self, in_parts: bool) -> None:

@@ -247,8 +247,8 @@ class ScanFollower:
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """The views of the selection, by their place among all views taken, which later frames do not change."""
         taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
-        wanted = parse_views(self._options.selection.views, np.zeros(taken.size))
-        return frames[np.isin(frames, taken[wanted])]
+        chosen = parse_views(self._options.selection.views, np.zeros(taken.size))
+        return frames[np.isin(frames, taken[chosen])]
 
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
@@ -373,7 +373,7 @@ class ScanFollower:
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if usable.jumps.size and self._options.selection.step(Jumps).wanted == "correct":
+        if usable.jumps.size and self._options.selection.step(Jumps).mode == "correct":
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
@@ -431,21 +431,21 @@ class ScanFollower:
         selection, projections = self._options.selection, self._joined()
         geometry, seen = self._seen(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
-        found = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
+        prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
-                    done[step.name] = step.apply(found, self.source.angles[projections.view_ids], lambda n, of: None)
+                    done[step.name] = step.apply(prepared, self.source.angles[projections.view_ids], lambda n, of: None)
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
                 if done[step.name].said:
                     self._tell({step.name: done[step.name]})
                     self._fit.replace_views(projections.data)
-        return replace(found, done=done)
+        return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""

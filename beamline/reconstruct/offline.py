@@ -80,7 +80,7 @@ def reconstruct_file(
         refuse_impossible(options)
     if options.cluster is not None:
         refuse_unusable(options.cluster)  # now, before the correction of the scan
-    wanted = None if options.truth is None else read_truth(options.truth)
+    truth_given = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
         require_finished(source, options)
@@ -99,8 +99,8 @@ def reconstruct_file(
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
     volumes = volume * options.target.written * (1 + options.uncertainty)
     options.target.require_room(*(options.disk_needs(volume) if slabs else (volumes, 0)))
-    if wanted is not None:  # before the work
-        fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
+    if truth_given is not None:  # before the work
+        fit_truth(truth_given, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     if few := partly_seen_warning(prepared.geometry):
         warn(few)
@@ -133,7 +133,7 @@ def reconstruct_file(
             # For the record: FBP takes all rays alike, and so do its figures.
             made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
             prepared = replace(prepared, view_weights=None)
-        truth = None if wanted is None else fit_truth(wanted, made.volume.grid, selection.binning)
+        truth = None if truth_given is None else fit_truth(truth_given, made.volume.grid, selection.binning)
         context = ReportContext(
             facts,
             selection,
@@ -192,8 +192,8 @@ def _refuse_foreign(options: ReconOptions) -> None:
         "a time budget": (options.budget is not None, "budget"),
         "checkpoints": (options.checkpoints.wanted, "checkpoints"),
     }
-    for what, (wanted, trait) in given.items():
-        if wanted and not getattr(options.method.traits, trait):
+    for what, (asked, trait) in given.items():
+        if asked and not getattr(options.method.traits, trait):
             owners = ", ".join(with_trait(trait))
             raise ConfigError(
                 f"{options.method.name} does not take {what} (of {owners}): leave that out, or choose another method."
@@ -240,10 +240,10 @@ class _Job:
         """
         method, budget = self.options.method, self.options.budget
         methods = candidates_of(method) if budget is not None else (method,)
-        for one in methods if self.options.cluster is None else ():
-            with self.refused(f" by {one.name}"):
+        for candidate in methods if self.options.cluster is None else ():
+            with self.refused(f" by {candidate.name}"):
                 warm_up(
-                    one,
+                    candidate,
                     self.prepared.geometry,
                     device=self.options.device,
                     on_kernel=compilation_events(self.sink, self.clock),
@@ -288,8 +288,8 @@ def _with_error_bars(job: _Job, made: Reconstruction, slabs: Sequence[Slab], dec
     if "ended_early" in made.settings:
         job.warn("The error bars were left out, as the reconstruction was stopped.")
         return made
-    said = "The volume is there; its error bars follow. Ctrl-C leaves them out."
-    job.sink(StateEntered("error_bars", said, time=job.clock.now()))
+    message = "The volume is there; its error bars follow. Ctrl-C leaves them out."
+    job.sink(StateEntered("error_bars", message, time=job.clock.now()))
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
     given = made.volume, method, job.prepared, job.options
@@ -297,17 +297,17 @@ def _with_error_bars(job: _Job, made: Reconstruction, slabs: Sequence[Slab], dec
     why = "as they were stopped"
     try:
         if slabs:
-            found = deviation_by_slabs(*given, slabs, decided.made, control, job.say)
+            deviation = deviation_by_slabs(*given, slabs, decided.made, control, job.say)
         else:
-            found = deviation_of(*given, decided.made, control)
+            deviation = deviation_of(*given, decided.made, control)
     except ValueError as error:  # hours may be in the volume
-        found, why = None, str(error)
-    if found is None:
+        deviation, why = None, str(error)
+    if deviation is None:
         job.warn(f"The error bars were left out: {why}. The volume is whole.")
         return made
     assert method.traits.error_bars is not None
     settings = dict(zip(("error_bars_spread", "error_bars_gradient"), method.traits.error_bars, strict=True))
-    return replace(made, deviation=found, settings={**made.settings, **settings})
+    return replace(made, deviation=deviation, settings={**made.settings, **settings})
 
 
 def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
@@ -347,8 +347,8 @@ def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
     # The sweeps of a finish follow the last step, and can be stopped as well.
     finishes = isinstance(method, FitMethod) and method.finish_sweeps > 0
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
-    said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return _recorded(result, early, said | ({"checkpoint_lost": lost} if lost else {})), chosen
+    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
+    return _recorded(result, early, resumed | ({"checkpoint_lost": lost} if lost else {})), chosen
 
 
 def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> tuple[Reconstruction, str]:

@@ -46,7 +46,7 @@ _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each volume of the series; f
 
 
 @dataclass(frozen=True)
-class WantedSeries:
+class SeriesRequest:
     """What is asked of a series.
 
     Attributes:
@@ -77,11 +77,11 @@ class SeriesNeeds:
     time: RunTime | None = None
 
     @classmethod
-    def of(cls, options: ReconOptions, wanted: WantedSeries, geometry: Geometry) -> SeriesNeeds:
+    def of(cls, options: ReconOptions, request: SeriesRequest, geometry: Geometry) -> SeriesNeeds:
         voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
-        memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
-        return cls((wanted.volumes, *shape), geometry.n_views, memory, memory_of(options), wanted.volumes * voxels)
+        memory = (_VOLUMES * request.volumes + _FIELDS) * voxels + _COPIES * rays
+        return cls((request.volumes, *shape), geometry.n_views, memory, memory_of(options), request.volumes * voxels)
 
     def refuse(self) -> None:
         """ConfigError where it takes more memory than it may."""
@@ -108,16 +108,16 @@ class SeriesNeeds:
         return [*lines, f"{'time':<10}about {least} to {most}, reading and correction not counted"]
 
 
-def series_needs(options: ReconOptions, wanted: WantedSeries, clock: Clock) -> SeriesNeeds:
+def series_needs(options: ReconOptions, request: SeriesRequest, clock: Clock) -> SeriesNeeds:
     """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
     with options.source.open() as source:
         geometry = stated_geometry(source, options.selection)
-    needs = SeriesNeeds.of(options, wanted, geometry)
+    needs = SeriesNeeds.of(options, request, geometry)
     needs.refuse()
     try:
-        return replace(needs, time=series_seconds(geometry, wanted.volumes, wanted.moves, _SWEEPS, clock.now))
+        return replace(needs, time=series_seconds(geometry, request.volumes, request.moves, _SWEEPS, clock.now))
     except ValueError as error:
-        raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
+        raise ConfigError(f"--time {request.volumes}: {error}. Nothing was written.") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class TimeSeriesResult:
                 volumes[at] = record.volume.data[:]
         return volumes
 
-    def told(self) -> dict[str, Any]:
+    def event_values(self) -> dict[str, Any]:
         """What the event `done` says, by name: all up to `ended_early`."""
         names = [each.name for each in fields(self)]
         return {name: getattr(self, name) for name in names[: names.index("ended_early") + 1]}
@@ -187,7 +187,7 @@ class TimeSeriesResult:
 
 def reconstruct_series(
     options: ReconOptions,
-    wanted: WantedSeries,
+    request: SeriesRequest,
     sink: Sink,
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
@@ -212,10 +212,10 @@ def reconstruct_series(
         facts = facts_of(source)
         prepared = prepare_projections(
             source, options.selection, warn,
-            check=lambda geometry: SeriesNeeds.of(options, wanted, geometry).refuse(), phases=phases,
+            check=lambda geometry: SeriesNeeds.of(options, request, geometry).refuse(), phases=phases,
         )  # fmt: skip
         times = times_of(source, prepared.projections.view_ids, warn)
-    options.target.require_room(SeriesNeeds.of(options, wanted, prepared.geometry).output)
+    options.target.require_room(SeriesNeeds.of(options, request, prepared.geometry).output)
     phases.enter("reconstruction")
     fit_began = clock.now()
     early, heard = False, sweeps_told(counting, _SWEEPS)
@@ -233,19 +233,22 @@ def reconstruct_series(
         with stop() as stopping:
             views = TimedViews(np.asarray(data, np.float32), prepared.geometry, times, weights)
             made = fit_series(
-                views, wanted.volumes, motion=wanted.moves, sweeps=_SWEEPS, seed=options.seed, go_on=go_on,
+                views, request.volumes, motion=request.moves, sweeps=_SWEEPS, seed=options.seed, go_on=go_on,
                 stop=stopping,
             )  # fmt: skip
             early = early or stopping()
     except ValueError as error:
-        raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
+        raise ConfigError(f"--time {request.volumes}: {error}. Nothing was written.") from error
     chosen, fit_seconds = "", clock.now() - fit_began
     if made.unseen_residuals is not None:
         chosen = _chosen(*made.unseen_residuals, moves=made.motion is not None)
         sink(StateEntered("chosen", f"{'Motion' if made.motion else 'No motion'}, by {chosen}.", time=clock.now()))
     phases.enter("writing")
     series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]))
-    shape, settings = series.data.shape, {"volumes": wanted.volumes, "moves": made.motion is not None, "chosen": chosen}
+    shape, settings = (
+        series.data.shape,
+        {"volumes": request.volumes, "moves": made.motion is not None, "chosen": chosen},
+    )
     if made.smooth is not None:
         settings["smooth"] = made.smooth
     first = Reconstruction(
@@ -269,7 +272,7 @@ def reconstruct_series(
         volume=prepared.stretched(first.volume),
         length_unit=prepared.length_unit,
         raw_file=str(facts.path.resolve()),
-        title=f"{wanted.volumes} volumes in time of {facts.name}",
+        title=f"{request.volumes} volumes in time of {facts.name}",
         sample=facts.sample or "not stated",
         time=clock.now(),
         parameters=parameters_of(first, prepared, context),

@@ -173,7 +173,7 @@ class ReconRecord:
         figures = ", ".join(f"{name} {value:.4g}" for name, value in self.metrics.items())
         return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
 
-    def told(self) -> dict[str, Any]:
+    def event_values(self) -> dict[str, Any]:
         """What the event `done` says of it, by name, in the order of its line."""
         parameters = self.parameters
         ends = {name: parameters[name] for name in _ENDS if name in parameters}

@@ -99,7 +99,7 @@ def dry_run(
     Raises:
         ConfigError, DataError: the comparison would be refused.
     """
-    start, own = now(), int(psutil.Process().memory_info().rss)
+    start, own_bytes = now(), int(psutil.Process().memory_info().rss)
     data, planned = plan(warn)
     sweep = sweep_seconds(data.geometry, now)
     table = planned.table
@@ -109,19 +109,19 @@ def dry_run(
 
     def expected(trial: Trial) -> ExpectedTrial:
         seconds = expected_seconds(trial, data.geometry, sweep)
-        return ExpectedTrial(trial.label, None if seconds is None else start + seconds, _memory(trial, data, own))
+        return ExpectedTrial(trial.label, None if seconds is None else start + seconds, _memory(trial, data, own_bytes))
 
     free = shutil.disk_usage(folder.absolute().parent).free
     return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())
 
 
-def _memory(trial: Trial, data: Data, own: int) -> int | None:
+def _memory(trial: Trial, data: Data, own_bytes: int) -> int | None:
     """Bytes: of a process that has loaded the libraries, the views twice (in their file and those used), the rest."""
     if trial.joint is not None:
         return None
     method = trial.build()
     coarse = data.geometry.binned(trial.binning)
-    return own + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
+    return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
 
 
 def _bytes(data: Data) -> int:

@@ -126,18 +126,18 @@ def _copies_of_toy(geometry: Geometry) -> tuple[F32, Geometry]:
 def by_parts(count: int, data: Data, fit: PartFit) -> VolumeAt:
     """A volume of each part of the views: of each energy, or of so long, with linear change between their middles."""
     n = data.geometry.n_views
-    own = data.shown[:n]
+    shown = data.shown[:n]
     if data.sections is None:
         edges = np.arange(count + 1) * n // count
-        in_order = np.argsort(own, kind="stable")
+        in_order = np.argsort(shown, kind="stable")
         parts = [np.sort(in_order[first:stop]) for first, stop in pairwise(edges.tolist())]
     else:
-        parts = [np.flatnonzero(own == energy) for energy in range(count)]
+        parts = [np.flatnonzero(shown == energy) for energy in range(count)]
     weights = None if data.weights is None else data.weights[:n]
     volumes = np.stack([
         fit(data.projections[at], data.geometry.select(at), None if weights is None else weights[at]) for at in parts
     ])  # fmt: skip
-    middles = np.array([own[at].mean() for at in parts])
+    middles = np.array([shown[at].mean() for at in parts])
     return lambda view: np.tensordot(_linear(view, middles), volumes, 1)
 
 

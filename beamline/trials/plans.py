@@ -87,33 +87,33 @@ def _beside_chosen(quick: Sequence[int], full: Sequence[int], gaussians: int, de
 
 def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     base: dict[str, Plain] = {"steps": _BASE_STEPS[depth], "gaussians": gaussians}
-    found = [TrialSettings("method", base)]
-    found += [TrialSettings("steps", base | {"steps": n}) for n in _STEPS[depth] if n != base["steps"]]
+    settings = [TrialSettings("method", base)]
+    settings += [TrialSettings("steps", base | {"steps": n}) for n in _STEPS[depth] if n != base["steps"]]
     counts = [max(1, round(factor * gaussians)) for factor in _FACTORS[depth]]
-    found += [TrialSettings("gaussians", base | {"gaussians": count}) for count in counts]
+    settings += [TrialSettings("gaussians", base | {"gaussians": count}) for count in counts]
     # A bin of two halves the detail across: a quarter of the Gaussians describes it.
     coarse = max(1, gaussians // 4)
-    found += [
+    settings += [
         TrialSettings("binning", {"steps": steps, "gaussians": coarse}, binning=2) for steps in _BINNED_STEPS[depth]
     ]
     others = [kernel.value for kernel in Kernel if kernel is not FitSettings().kernel]
-    found += [TrialSettings("kernel", base | {"fit.kernel": name}) for name in others]
-    found.append(TrialSettings("start", base | {"start": "tv"}))
-    found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
-    found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
-    found.append(TrialSettings("rectification", base | {"fit.rays.rectified": False}))
-    return found
+    settings += [TrialSettings("kernel", base | {"fit.kernel": name}) for name in others]
+    settings.append(TrialSettings("start", base | {"start": "tv"}))
+    settings.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
+    settings += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
+    settings.append(TrialSettings("rectification", base | {"fit.rays.rectified": False}))
+    return settings
 
 
 def _fields(gaussians: int, depth: Depth) -> list[TrialSettings]:
     base, *longer = ({"steps": steps} for steps in _FIELD_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", one) for one in longer)]
+    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
 
 
 def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
     """The published fit in fewer than its 30 000 steps, which would take a trade-off hours."""
     base, *longer = ({"steps": steps, "gaussians": gaussians} for steps in _PUBLISHED_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", one) for one in longer)]
+    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
 
 
 TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
@@ -194,7 +194,10 @@ def plan_of_energies(
 def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Trial]:
     """In short runs."""
     first = [trials_of(method, gaussians, "quick")[0] for method in methods]
-    return [Trial("method", name, n_views, settings=one.settings) for name, one in zip(methods, first, strict=True)]
+    return [
+        Trial("method", name, n_views, settings=baseline.settings)
+        for name, baseline in zip(methods, first, strict=True)
+    ]
 
 
 def work(trial: Trial) -> float:
@@ -238,22 +241,24 @@ def seconds_left(
     """
     if not done:
         return None
-    fixed = sum(one.wall - one.working for one in done) / len(done)
-    typical = sum(one.working for one in done) / len(done)
+    fixed = sum(timed.wall - timed.working for timed in done) / len(done)
+    typical = sum(timed.working for timed in done) / len(done)
     costs = [
-        (one.working, known)
-        for one in done
-        if one.working > 0 and (known := cost(one.trial)) is not None and not one.trial.build().traits.direct
+        (timed.working, amount_expected)
+        for timed in done
+        if timed.working > 0
+        and (amount_expected := cost(timed.trial)) is not None
+        and not timed.trial.build().traits.direct
     ]  # a direct method is over too soon to tell how fast this machine is
-    whole, total = sum(known for _, known in costs), 0.0
+    whole, total = sum(amount_expected for _, amount_expected in costs), 0.0
     for trial in left:
         if trial.seconds_asked is not None:
             total += fixed + trial.seconds_asked
             continue
-        same = [one for one in done if one.trial.method == trial.method and one.working > 0]
-        amount = sum(work(one.trial) for one in same)
+        same = [timed for timed in done if timed.trial.method == trial.method and timed.working > 0]
+        amount = sum(work(timed.trial) for timed in same)
         if amount > 0:
-            seconds = work(trial) * sum(one.working for one in same) / amount
+            seconds = work(trial) * sum(timed.working for timed in same) / amount
         elif whole > 0 and (unseen := cost(trial)) is not None:
             seconds = unseen * sum(working for working, _ in costs) / whole
         else:

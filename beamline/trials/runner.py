@@ -81,12 +81,12 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
         ConfigError, DataError: nothing was written.
     """
     refuse_existing(asked.folder)
-    wanted = None if asked.truth is None else read_truth(asked.truth)
+    truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         light, facts = light_in(source, asked.light), dict(facts_of(source).table)
         prepared = prepare_projections(source, asked.selection, warn)
     grid = Grid.matching(prepared.geometry)
-    truth = None if wanted is None else fit_truth(wanted, grid, asked.selection.binning).data
+    truth = None if truth_given is None else fit_truth(truth_given, grid, asked.selection.binning).data
     facts["volume"] = " × ".join(map(str, grid.shape))
     if light is not None:
         facts["light"] = "; ".join(light.said())
@@ -257,18 +257,18 @@ def _each(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet)
     """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets those that the page shows."""
     begin, timed, todo = rig.now(), list[Timed](), table.todo
     for n, index in enumerate(todo):
-        trial, left = table.outcomes[index].trial, rig.seconds
-        if left is not None and (refusal := _no_time(seconds_left(timed, [trial], rig.cost) or 0.0, left)):
+        trial, seconds = table.outcomes[index].trial, rig.seconds
+        if seconds is not None and (refusal := _no_time(seconds_left(timed, [trial], rig.cost) or 0.0, seconds)):
             table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
             yield table
             continue
         eta = seconds_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.cost)
-        eta = eta if eta is None or left is None else min(eta, left)
+        eta = eta if eta is None or seconds is None else min(eta, seconds)
         rate = 60 * n / max(rig.now() - begin, 1e-9)
         rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta, rate))
         started = rig.now()
         try:
-            outcome, volume = rig.run(trial, left, keep=trial.group in _SHOWN)
+            outcome, volume = rig.run(trial, seconds, keep=trial.group in _SHOWN)
         except KeyboardInterrupt:
             yield table.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             raise
@@ -280,9 +280,9 @@ def _each(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet)
         rig.emit(event_of(table, layout, n + 1, len(todo), outcome))
 
 
-def _no_time(needed: float, left: float) -> str:
+def _no_time(needed: float, remaining: float) -> str:
     """Why a trial of so many seconds is not begun; empty: there is time."""
-    if needed < left:
+    if needed < remaining:
         return ""
-    about = f"it would take about {needed:.0f} s, of which {left:.0f} s were left"
-    return f"not begun: {about if left > 0 else 'no time was left'}"
+    about = f"it would take about {needed:.0f} s, of which {remaining:.0f} s were left"
+    return f"not begun: {about if remaining > 0 else 'no time was left'}"

@@ -53,14 +53,14 @@ def compile_for(checkouts: Sequence[str]) -> None:
     from numba.core.dispatcher import Dispatcher
 
     compiled = 0
-    known = _signatures([ROOT, *map(Path, checkouts)])
-    for module in sorted({module for module, _ in known}):
+    signatures = _signatures([ROOT, *map(Path, checkouts)])
+    for module in sorted({module for module, _ in signatures}):
         loaded = importlib.import_module(module)
         for value in list(vars(loaded).values()):
             getattr(value, "_dispatcher", None)  # `beamline.core.jit` makes it when it is first asked for
         kernels = [d for d in gc.get_objects() if issubclass(type(d), Dispatcher) and d.py_func.__module__ == module]
         for kernel in kernels:
-            for types in known.get((module, kernel.py_func.__qualname__), ()):
+            for types in signatures.get((module, kernel.py_func.__qualname__), ()):
                 try:
                     kernel.compile(types)
                     compiled += 1
@@ -91,7 +91,7 @@ def _tag() -> str:
 
 def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     """Types that kernels were compiled for, by module and name."""
-    archive, known = archive_of(sys.version_info[:2]), defaultdict[tuple[str, str], set[Any]](set)
+    archive, signatures = archive_of(sys.version_info[:2]), defaultdict[tuple[str, str], set[Any]](set)
     packed: list[tuple[str, str, bytes]] = []
     if archive.is_file():
         packed += (
@@ -112,8 +112,8 @@ def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
         _, index = _read(content)
         # tv._dual_step-94.py311.nbi, voxelize._filler.locals.kernel-155.py311.nbi
         kernel = name.partition(".")[2].rsplit("-", 1)[0].replace(".locals.", ".<locals>.")
-        known[module, kernel].update(key[0] for key in index)
-    return known
+        signatures[module, kernel].update(key[0] for key in index)
+    return signatures
 
 
 def _read(content: bytes) -> tuple[Any, Index]:

@@ -66,7 +66,7 @@ def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
         return frozenset()
     try:
         with cpuinfo.open(encoding="ascii", errors="replace") as lines:
-            found = next((line for line in lines if line.startswith("flags")), "")
+            line_of_flags = next((line for line in lines if line.startswith("flags")), "")
     except OSError:
         return frozenset()
-    return frozenset(found.partition(":")[2].split())
+    return frozenset(line_of_flags.partition(":")[2].split())

@@ -180,13 +180,13 @@ def best_candidate(
     Where nothing can be held out, or `control` ends the trials, it is the fit. No prior is told for a fit that takes
     matter beyond the box off the views: from all of them a region of interest gets one that costs 1.3 dB.
     """
-    data, known = masked(problem.projections, problem.use.weights)
+    data, weights = masked(problem.projections, problem.use.weights)
     if not data.any():
         return 2, {}
     watch, decide = _Watch(control, problem.geometry.n_views), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
-    solve(method, projector, data, weight=known, on_trial=watch.trial, decide=decide)
+    solve(method, projector, data, weight=weights, on_trial=watch.trial, decide=decide)
     if watch.ended or "strength" not in decide.made:
         return 2, {}
     return method.best, {} if method.best == 2 and method.apart else prior_decisions(decide.made)
@@ -250,7 +250,7 @@ def finish(
     prepared = _prepared(gaussians, problem, fit)
     if prepared is None:
         return Finished(volume, 0)
-    data, known = prepared
+    data, weights = prepared
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     projector, decide = Projector(problem.geometry, volume.grid), control.decide or Decisions(problem.seed)
     beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
@@ -258,7 +258,7 @@ def finish(
         data -= beyond
     watch, count = _Watch(control, problem.geometry.n_views), SWEEPS if sweeps is None else sweeps
     refined = solve(
-        _Finish(count, sweeps is None), projector, data, weight=known, start=start, nonnegative=nonnegative,
+        _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
         on_iteration=lambda sweep, _: watch.sweep(sweep, max(sweep, count)), on_trial=watch.trial, decide=decide,
     )  # fmt: skip
     return Finished(refined, count)
@@ -266,12 +266,12 @@ def finish(
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> tuple[F32, F32 | None] | None:
     """Views without outliers and rings, and their weights; None: these or those of the model are empty."""
-    data, known = masked(problem.projections, problem.use.weights)
+    data, weights = masked(problem.projections, problem.use.weights)
     model = project(gaussians, problem.geometry, truncation=fit.truncation, model=fit.rays).numpy()
     if not (data.any() and model.any()):
         return None
-    data, known = _without_outliers(data, known, model)
-    return data - ring_offsets(data - model, problem.geometry.axis_col), known
+    data, weights = _without_outliers(data, weights, model)
+    return data - ring_offsets(data - model, problem.geometry.axis_col), weights
 
 
 def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:

@@ -57,7 +57,7 @@ class FitMethod(Method, Protocol):
 
     @property
     def finish_sweeps(self) -> int:
-        """Sweeps of the finish; where views held out choose them, the fewest."""
+        """Sweeps of total variation in the finish; 0: there is none."""
 
 
 @runtime_checkable

@@ -107,17 +107,17 @@ class _Views:
     """The views of a fit, and those kept back.
 
     Attributes:
-        told: geometry of all views, with an angle of each row.
+        all_geometry: geometry of all views, with an angle of each row.
         data, weights: of all views, finite; weights of a mean of about 1 on matter.
         used, kept_back: numbers of views.
         joined: pixels that are joined for the steps.
-        seen: geometry of the views that the steps see, `p` their line integrals, `known` their weights.
+        seen: geometry of the views that the steps see, `p` their line integrals, `p_weights` their weights.
         field: box of the Gaussians.
         count: Gaussians at the start.
         fitted: what the finish sees.
     """
 
-    told: Geometry
+    all_geometry: Geometry
     data: F32
     weights: F32 | None
     used: NDArray[np.intp]
@@ -125,7 +125,7 @@ class _Views:
     joined: int
     seen: Geometry
     p: F32
-    known: F32 | None
+    p_weights: F32 | None
     field: Grid
     count: int
     fitted: ReconProblem
@@ -133,8 +133,8 @@ class _Views:
     @classmethod
     def of(cls, method: FitMethod, problem: ReconProblem) -> _Views:
         # Slices that turn against each other are a twist of the model: the fit sees all rows at the angle of the first.
-        told, geometry = problem.geometry, problem.geometry.at_row(0)
-        if told.skew and isinstance(method.gaussians, Gaussians):
+        all_geometry, geometry = problem.geometry, problem.geometry.at_row(0)
+        if all_geometry.skew and isinstance(method.gaussians, Gaussians):
             raise ValueError(
                 "Gaussians to start from are not taken where rows see angles of their own: give their number"
             )
@@ -160,17 +160,17 @@ class _Views:
             pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
         )  # fmt: skip
         measured, trusted = data[used], None if weights is None else weights[used]
-        p, known, seen = join_pixels(measured, trusted, views, joined)
+        p, p_weights, seen = join_pixels(measured, trusted, views, joined)
         field = Grid.for_fit(seen, problem.grid, wider=leaves_the_field(measured, views))
-        fitted = replace(problem, projections=measured, geometry=told.select(used), use=DataUse(trusted))
-        return cls(told, data, weights, used, kept_back, joined, seen, p, known, field, count, fitted)
+        fitted = replace(problem, projections=measured, geometry=all_geometry.select(used), use=DataUse(trusted))
+        return cls(all_geometry, data, weights, used, kept_back, joined, seen, p, p_weights, field, count, fitted)
 
     def unseen(self, problem: FitProblem, settings: FitSettings, unit: float) -> FitProblem | None:
         """The views kept back, as the steps see theirs."""
         if not self.kept_back.size:
             return None
         weights = None if self.weights is None else self.weights[self.kept_back]
-        geometry = self.told.at_row(0).select(self.kept_back).seen_with(self.seen.width)
+        geometry = self.all_geometry.at_row(0).select(self.kept_back).seen_with(self.seen.width)
         q, others, apart = join_pixels(self.data[self.kept_back], weights, geometry, self.joined)
         return fit.problem_of(q, apart, self.field, unit, settings, problem.backend, others)
 
@@ -229,7 +229,7 @@ class _Run:
 
     def model(self) -> tuple[Volume, Gaussians]:
         """The volume of the Gaussians, and these, turned as the rows see them."""
-        model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.views.told, 1)
+        model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.views.all_geometry, 1)
         filled = voxelize(model, self.problem.grid, truncation=self.method.fit.truncation).numpy()
         return Volume(filled, self.problem.grid), model
 
@@ -290,7 +290,7 @@ def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: De
     """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
 
     def short(part: ReconProblem, watched: RunControl) -> Reconstruction:
-        share = part.geometry.detector_shape[0] / views.told.detector_shape[0]
+        share = part.geometry.detector_shape[0] / views.all_geometry.detector_shape[0]
         return run_fit(method.for_trial(share), part, watched)
 
     at, prior = best_candidate(views.fitted, method.fit, control, short)
@@ -314,7 +314,7 @@ def _started(
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
-    fitting = fit.problem_of(views.p, views.seen, views.field, state.unit, settings, backend, views.known)
+    fitting = fit.problem_of(views.p, views.seen, views.field, state.unit, settings, backend, views.p_weights)
     if settings.tv_weight is None:
         fitting = replace(fitting, change=decide("change", lambda: mean_change(views.p, views.seen, views.field)))
     unseen = views.unseen(fitting, settings, state.unit)
@@ -340,8 +340,8 @@ def _steps(run: _Run) -> None:
         done += 1
         if not length.planned and done == _TIMED and length.seconds is not None:
             spent = now() - begin
-            left, step = length.seconds - spent, spent / done
-            length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, left, step))), spent)
+            remaining, step = length.seconds - spent, spent / done
+            length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             run.tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
@@ -381,7 +381,7 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
         volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative
     )  # fmt: skip
     if kept_back.size:
-        views = run.views.told.select(kept_back)
+        views = run.views.all_geometry.select(kept_back)
         if _worse(finished, volume, run.views.data[kept_back], views):
             return volume, 0
     return finished, sweeps
@@ -398,11 +398,11 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     count = method.gaussians or default_count(geometry, grid.voxel_size)
     needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
     needed += first_draw_seconds(grid, count, now)
-    left = max(end - now(), 0.0)
-    if needed <= left:
+    remaining = max(end - now(), 0.0)
+    if needed <= remaining:
         return 1
     factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
-    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * left), factors[-1])
+    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
     then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
     warnings.warn(
         f"{method.seconds:.3g} s do not suffice for the start of the fit, which takes about {needed:.3g} s: "
@@ -412,12 +412,12 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     return factor
 
 
-def _finish_in_time(run: _Run, left: float, step: float) -> FinishPlan:
+def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
     """The sweeps of the finish and their seconds, if `left` seconds remain after first steps of `step` seconds each.
     `finish_within` gives the sweeps; if the time suffices for two, the method's own number is used."""
-    method, room = run.method, FINISH_SHARE * left
+    method, room = run.method, FINISH_SHARE * remaining
     geometry = run.views.fitted.geometry.at_row(0)
-    plan = finish_within(room, left - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
+    plan = finish_within(room, remaining - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
     return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
 
 

@@ -45,8 +45,10 @@ def simplest(residuals: Sequence[F64]) -> int:
 
     The first whose residuals exceed those of the best by no more than one standard error of the mean difference.
     """
-    best = min(residuals, key=lambda one: float(one.mean()))
-    alike = (n for n, one in enumerate(residuals) if one is best or not beyond_chance(one - best, _ERRORS))
+    best = min(residuals, key=lambda residual: float(residual.mean()))
+    alike = (
+        n for n, residual in enumerate(residuals) if residual is best or not beyond_chance(residual - best, _ERRORS)
+    )
     return next(alike)
 
 
@@ -190,11 +192,11 @@ def choose_weight(
     def chosen() -> list[float]:
         balance = NoiseBalance.of(problem, start, modelled)
         judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
-        found = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
-        if judge is None or found is None:
+        preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
+        if judge is None or preferred is None:
             return [balance.first, balance.noise]
-        judge.keep("weight", found)
-        return [found.strength]
+        judge.keep("weight", preferred)
+        return [preferred.strength]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0]) if noise else first
@@ -306,12 +308,12 @@ class HeldOutTrial:
         unseen = self.unseen
         if self._ended:
             return np.full(len(unseen.data), np.inf)
-        left = unseen.projector.forward_lines(x) - unseen.data
+        differences = unseen.projector.forward_lines(x) - unseen.data
         if beyond is not None:
-            left += beyond
-        left = whitened(left, unseen.weight)
+            differences += beyond
+        differences = whitened(differences, unseen.weight)
         if unseen.projector.geometry.is_cone:
-            left[unseen.data <= _MATTER * np.percentile(unseen.data, 99)] = np.nan
-            return np.array([median_deviation(view) for view in left if np.isfinite(view).any()])
-        squares = [np.nanmean(np.square(view, dtype=np.float64)) for view in left if np.isfinite(view).any()]
+            differences[unseen.data <= _MATTER * np.percentile(unseen.data, 99)] = np.nan
+            return np.array([median_deviation(view) for view in differences if np.isfinite(view).any()])
+        squares = [np.nanmean(np.square(view, dtype=np.float64)) for view in differences if np.isfinite(view).any()]
         return np.sqrt(np.array(squares))

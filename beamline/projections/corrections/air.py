@@ -108,14 +108,14 @@ class Air:
 
         air = views.projections.air
         levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
-        said, terms = without_background(
+        sentence, terms = without_background(
             views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked),
             levelled,
         )  # fmt: skip
         line = any(views.projections.air_columns)
         nothing = "no surface taken off, a line through the air at the edges" if line else "none taken off"
-        parameters: dict[str, Any] = {"surface": self.surface, "background": said or nothing}
-        return StepDone(said, parameters if terms is None else {**parameters, "background_terms": terms})
+        parameters: dict[str, Any] = {"surface": self.surface, "background": sentence or nothing}
+        return StepDone(sentence, parameters if terms is None else {**parameters, "background_terms": terms})
 
 
 def background_memory(geometry: Geometry) -> int:
@@ -161,7 +161,7 @@ class _Views:
 def without_background(
     data: F32,
     geometry: Geometry,
-    wanted: Surface,
+    surface: Surface,
     others: tuple[F32, Geometry] | None = None,
     unknown: Mask | None = None,
     levelled: float = 0.0,
@@ -171,7 +171,7 @@ def without_background(
     Returns what was done, in words (empty: nothing), and the terms of the mean surface that was taken off.
 
     Args:
-        wanted: "auto": where the views confirm it; a number: polynomials of this order.
+        surface: "auto": where the views confirm it; a number: polynomials of this order.
         others: further views and their geometry, which lose their background, too.
         unknown: bool [row, col], pixels that were not measured.
         levelled: line integral of the air at the edges that was taken off already, the mean of the views.
@@ -182,9 +182,9 @@ def without_background(
     from beamline.projections.truncation import cut_sides
     from recon.base.noise import noise_level
 
-    if wanted == "none":
+    if surface == "none":
         return "", None
-    order = None if wanted == "auto" else wanted
+    order = None if surface == "auto" else surface
     views = _Views(data, geometry, unknown)
     shows_air = _see_all_sides(geometry) and not cut_sides(
         data, geometry
@@ -211,10 +211,10 @@ def without_background(
         if unseen is not None:
             unseen.remove(more.data)
     fitted.remove(data)
-    said = (
+    sentence = (
         f"Background of the beam: {seen}; taken off. Air was {fitted.before:.2g} off nothing and is {fitted.after:.2g}."
     )
-    return said, fitted.coefficients.mean(axis=0)
+    return sentence, fitted.coefficients.mean(axis=0)
 
 
 def _described(fitted: Background, levelled: float) -> str:

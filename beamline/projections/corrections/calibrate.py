@@ -119,9 +119,9 @@ class Calibrate:
         done = [views.done[self.name]] if self.name in views.done else []
         learn = {"background": without_learnt_background, "gains": without_learnt_gains}
         done += [learn[term](views, progress) for term in OF_VIEWS if term in self.terms]
-        said = " ".join(each.said for each in done if each.said)
+        sentence = " ".join(each.said for each in done if each.said)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
-        return StepDone(said, {"calibrate": ",".join(self.terms), "calibrate_said": said, **values})
+        return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +158,8 @@ class Calibrated:
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The geometry of these rows of the file, which may be binned, as it was learnt."""
         at = np.searchsorted(self.frames, view_ids)
-        own = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
-        return with_pivot(own.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
+        change = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
+        return with_pivot(change.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
 
 
 def calibrated(
@@ -188,10 +188,10 @@ def calibrated(
     views = ScanCorrection(source, band, lambda _: None).at_once(frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
-    known = ~areas(views.masked)
+    lit = ~areas(views.masked)
     try:
         learnt = learn_geometry(
-            views.data, before, terms, progress, None if known.all() else known.astype(np.float32)
+            views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
@@ -246,18 +246,18 @@ def without_learnt_background(views: PreparedProjections, progress: Progress) ->
     judged = f"views held out are left {learnt.without:.3g} without it and {learnt.left:.3g} with it"
     values = {"learnt_background_held_out_before": learnt.without, "learnt_background_held_out_after": learnt.left}
     if not (learnt.drift or learnt.mean):
-        said = "Background learnt with the volume: views held out confirm none; nothing taken off."
-        return StepDone(said, {"learnt_background": said, **values})
+        sentence = "Background learnt with the volume: views held out confirm none; nothing taken off."
+        return StepDone(sentence, {"learnt_background": sentence, **values})
     learnt.remove(data, times(ids))
     if views.held_out is not None and views.held_out_ids is not None:
         learnt.remove(views.held_out[0], times(views.held_out_ids))
     what = " and ".join(name for name, there in (("its drift", learnt.drift), ("its mean", learnt.mean)) if there)
-    said = (
+    sentence = (
         f"Background learnt with the volume: {what}, {learnt.size:.3f} of line integral (root mean square), on average "
         f"from {learnt.lowest:+.3f} to {learnt.highest:+.3f}; taken off: {judged}. What all views show alike cannot be "
         "told from density where the volume has no air."
     )
-    return StepDone(said, {"learnt_background": said, "learnt_background_terms": learnt.coefficients, **values})
+    return StepDone(sentence, {"learnt_background": sentence, "learnt_background_terms": learnt.coefficients, **values})
 
 
 def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
@@ -273,14 +273,14 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     if learnt.without == 0:
         judged = "no stripes are seen in the views that are the detector's"
     if not learnt.confirmed:
-        said = f"Gains learnt with the volume: none taken off; {judged}."
-        return StepDone(said, {"learnt_gains": said, **values})
+        sentence = f"Gains learnt with the volume: none taken off; {judged}."
+        return StepDone(sentence, {"learnt_gains": sentence, **values})
     for view in views.projections.data:
         view -= learnt.pixels
     if views.held_out is not None:
         views.held_out[0][...] -= learnt.pixels
-    said = (
+    sentence = (
         f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
         f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."
     )
-    return StepDone(said, {"learnt_gains": said, "learnt_gains_of_pixels": learnt.pixels, **values})
+    return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

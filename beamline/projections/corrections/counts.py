@@ -92,8 +92,8 @@ def photons_of(
     from beamline.projections.read import read_binned, spoilt_frames
     from recon.prep.counts import Photons, photon_transfer
 
-    wanted = selection.step(CountModel)
-    if wanted.noise == "log":
+    model = selection.step(CountModel)
+    if model.noise == "log":
         return None
     binning = selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
@@ -103,26 +103,26 @@ def photons_of(
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (used.flats, used.darks)
     )
-    if wanted.gain is not None:  # a mean of n pixels has n times as many photons a count
-        light = _counts_of_light(references) * binning**2 / wanted.gain
+    if model.gain is not None:  # a mean of n pixels has n times as many photons a count
+        light = _counts_of_light(references) * binning**2 / model.gain
         low, high = _PHOTONS
         if not low <= light <= high:
             raise ConfigError(
-                f"--gain {wanted.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
+                f"--gain {model.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
                 f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
-        photons = Photons(wanted.gain / binning**2, variance)
+        photons = Photons(model.gain / binning**2, variance)
     else:
         try:
             photons = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
         except ValueError as error:
-            if wanted.noise == "auto":
+            if model.noise == "auto":
                 return None
             raise ConfigError(
                 f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
             ) from error
-    if wanted.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
+    if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
         return None
     return photons
 

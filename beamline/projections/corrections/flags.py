@@ -34,13 +34,13 @@ class Flags:
     """How the monitor's flags are used. `usable_views` chooses the views; `jumps` corrects those after a jump.
 
     Attributes:
-        wanted: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
+        mode: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
             the frames now, and its flags count in place of the file's. "ignore": all views are alike.
     """
 
     name: ClassVar[str] = "flags"
     follows: ClassVar[tuple[str, ...]] = ()
-    wanted: str = option(
+    mode: str = option(
         "--flags",
         "use",
         "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, and "
@@ -51,16 +51,16 @@ class Flags:
 
     @property
     def used(self) -> bool:
-        return self.wanted != "ignore"
+        return self.mode != "ignore"
 
     @property
     def judged(self) -> bool:
-        return self.wanted == "judge"
+        return self.mode == "judge"
 
     @property
     def needs_finished(self) -> str:
-        said = "--flags judge is for a finished scan; a running one is judged while it is taken."
-        return said if self.judged else ""
+        sentence = "--flags judge is for a finished scan; a running one is judged while it is taken."
+        return sentence if self.judged else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
@@ -83,17 +83,17 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
             return UsableViews(rows, flags=flags)
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
-        said = f"--flags ignore: {n} are used as they are."
-        return UsableViews(rows, said=said, flags=flags)
+        sentence = f"--flags ignore: {n} are used as they are."
+        return UsableViews(rows, said=sentence, flags=flags)
     treated = treatment_of(flags, views, source.shape)
     if not treated.said:
         return UsableViews(rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
     gap = gap_said(source, rows, good)
-    said = f"{treated.said}{gap and f' They{gap}.'} --flags ignore takes all alike."
+    sentence = f"{treated.said}{gap and f' They{gap}.'} --flags ignore takes all alike."
     regions = regions_of(treated.flags, source.shape)
-    return UsableViews(good, weights, int(treated.left_out.sum()), said, flags, regions, treated.jumps)
+    return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
 def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
@@ -105,8 +105,8 @@ def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.in
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
     """Radians between neighbouring views that are furthest apart; views a `period` apart see the same."""
-    known = np.sort(np.mod(angles[np.isfinite(angles)], period))
-    return period if known.size == 0 else float(np.diff(known, append=known[0] + period).max())
+    sorted_angles = np.sort(np.mod(angles[np.isfinite(angles)], period))
+    return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 
 
 def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:

@@ -36,7 +36,7 @@ _NODE = 40_000  # bytes of a curve for each energy
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
 
 
-def _wanted(text: str) -> str | None:
+def _model(text: str) -> str | None:
     """`fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
@@ -51,50 +51,50 @@ class Hardening:
     """How beam hardening is corrected.
 
     Attributes:
-        wanted: "fit": by a curve that is fitted on the views; `material:beam` as the user said it; None: not at all.
+        model: "fit": by a curve that is fitted on the views; `material:beam` as the user said it; None: not at all.
         spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
-            light; None: that of `wanted`.
+            light; None: that of `model`.
     """
 
     name: ClassVar[str] = "hardening"
     follows: ClassVar[tuple[str, ...]] = ("rings",)
-    wanted: str | None = option(
+    model: str | None = option(
         "--hardening",
         "none",
         "Correct beam hardening of a sample of one material. fit: by a curve fitted to its views. MATERIAL:BEAM: by "
         "attenuation, where BEAM is a tube (60kV), a tube behind mm of filters (60kV,Al=1,Cu=0.1), or a text file with "
         "a line 'keV weight' for each energy.",
-        parse=_wanted,
+        parse=_model,
         metavar="none|fit|MATERIAL:BEAM",
     )
     spectrum: Spectrum | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        if self.wanted is None or self.wanted == "fit" or self.spectrum is not None:
+        if self.model is None or self.model == "fit" or self.spectrum is not None:
             return
         try:
-            object.__setattr__(self, "spectrum", in_beam(*self.wanted.split(":", 1)))
+            object.__setattr__(self, "spectrum", in_beam(*self.model.split(":", 1)))
         except ValueError as error:
-            raise ValueError(f"--hardening {self.wanted}: {error}.") from error
+            raise ValueError(f"--hardening {self.model}: {error}.") from error
 
     @property
     def needs_finished(self) -> str:
-        return "" if self.wanted is None else "--hardening is for a finished scan: its curve is of all views."
+        return "" if self.model is None else "--hardening is for a finished scan: its curve is of all views."
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, self))
+        return StepMemory(alone=0 if self.model is None else curve_memory(part.geometry, self))
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
-        if self.wanted is None:
+        if self.model is None:
             return StepDone("", {"hardening": "not corrected"})
-        curve, said = curve_of(views.projections.data, views.geometry, self)
+        curve, sentence = curve_of(views.projections.data, views.geometry, self)
         if curve is not None:
             curve.linearise(views.projections.data, views.projections.weights)
             if views.held_out is not None:
                 curve.linearise(views.held_out[0])
-        return StepDone(said, {"hardening": said})
+        return StepDone(sentence, {"hardening": sentence})
 
 
 def in_beam(material: str, beam: str) -> tuple[F64, F64]:
@@ -126,13 +126,13 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
     return mass_attenuation(material, energies), weights
 
 
-def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve | None, str]:
+def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | None, str]:
     """The curve of a scan's line integrals [view, row, col], and a sentence about it; None where none is to be used."""
     from recon.prep.hardening import NoCurveError, curve_of_spectrum
 
     highest = max(float(view.max()) for view in views)
-    if wanted.spectrum is not None:
-        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.wanted}"
+    if step.spectrum is not None:
+        curve, how = curve_of_spectrum(*step.spectrum, highest), f"of {step.model}"
     else:
         try:
             curve, explained = fitted(views, geometry)
@@ -145,13 +145,13 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
 
 
-def curve_memory(geometry: Geometry, wanted: Hardening) -> int:
+def curve_memory(geometry: Geometry, step: Hardening) -> int:
     """Most bytes that the curve of such views takes, and their correction by it."""
     from recon.voxels.fbp import fbp_memory
 
     view = _CURVED * 4 * math.prod(geometry.detector_shape)
-    if wanted.spectrum is not None:
-        return max(view, _NODE * wanted.spectrum[0].size)
+    if step.spectrum is not None:
+        return max(view, _NODE * step.spectrum[0].size)
     _, _, small = _small(geometry)
     grid, rays = Grid.matching(small), small.n_views * math.prod(small.detector_shape)
     return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))

@@ -46,13 +46,13 @@ class Jumps:
     """What becomes of views on either side of an alarm of motion.
 
     Attributes:
-        wanted: "correct": see `find_jumps`. "ignore": they are used as they are.
+        mode: "correct": see `find_jumps`. "ignore": they are used as they are.
     """
 
     name: ClassVar[str] = "jumps"
     follows: ClassVar[tuple[str, ...]] = ("phase",)
     needs_finished: ClassVar[str] = ""
-    wanted: str = option(
+    mode: str = option(
         "--jumps",
         "correct",
         "correct: after the monitor saw the sample jump, correct the views for its shift and turn, or leave them out. "
@@ -61,7 +61,7 @@ class Jumps:
     )
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=_search_memory(part.source, part.selection) if self.wanted == "correct" else 0)
+        return StepMemory(alone=_search_memory(part.source, part.selection) if self.mode == "correct" else 0)
 
     def place(
         self,
@@ -73,11 +73,11 @@ class Jumps:
     ) -> ViewMotion:
         if stated_poses(source, selection) is not None:  # it states where the sample was
             return Unmoved(usable.frames)
-        if self.wanted == "correct":
+        if self.mode == "correct":
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
-        said = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return SampleJumps(usable.frames, said=said if usable.jumps.size else "")
+        sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
+        return SampleJumps(usable.frames, said=sentence if usable.jumps.size else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,9 @@ def find_jumps(
     best = _needed(fit.sizes, clusters, apart, looked, progress)
     assert best.verdict is not None
     bad = np.flatnonzero(~_good(best.verdict))
-    real = sorted({*best.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
+    real = sorted(
+        {*best.jumps, *(cluster for cluster in clusters if np.isin(apart[[cluster[0], cluster[1] + 1]], bad).any())}
+    )
     groups = part_groups(fit.sizes, real)
     spoilt = np.isin(apart, bad)
     moves = [best.moves[max(apart[groups == at])] for at in range(groups.max() + 1)]
@@ -223,19 +225,19 @@ def _needed(
     All guesses are judged by the same views, of the groups `apart` of all clusters. A cluster with too few views on one
     side is a jump in any case.
     """
-    untold = [one for one in clusters if min(apart[one[0]], apart[one[1] + 1]) < 0]
-    left = len(clusters) - len(untold)
-    made, most = 0, 1 + left * (left + 1) // 2
+    certain = [cluster for cluster in clusters if min(apart[cluster[0]], apart[cluster[1] + 1]) < 0]
+    n_open = len(clusters) - len(certain)
+    n_made, most = 0, 1 + n_open * (n_open + 1) // 2
 
     def guess(jumps: list[tuple[int, int]]) -> _Guess:
-        nonlocal made
-        found, made = _guess(sizes, jumps, apart, looked), made + 1
-        progress(made, most)
-        return found
+        nonlocal n_made
+        made, n_made = _guess(sizes, jumps, apart, looked), n_made + 1
+        progress(n_made, most)
+        return made
 
-    best = guess(untold)
+    best = guess(certain)
     while len(best.jumps) < len(clusters):
-        tried = [guess(sorted([*best.jumps, one])) for one in clusters if one not in best.jumps]
+        tried = [guess(sorted([*best.jumps, cluster])) for cluster in clusters if cluster not in best.jumps]
         better = min(tried, key=lambda guess: guess.verdict.overall)
         if not better.verdict.overall < (1 - _HELPS) * best.verdict.overall:
             break
@@ -261,7 +263,7 @@ def _guess(sizes: I64, jumps: list[tuple[int, int]], apart: I64, looked: Sequenc
 def _good(verdict: Judgement) -> NDArray[np.bool_]:
     """[group] those that can be used with the longest one, whose own deviation is the one that is compared with."""
     better = verdict.together <= (1 + _HELPS) * verdict.alone
-    good = np.array([better and own <= ALIKE * verdict.together for own in verdict.others])
+    good = np.array([better and deviation <= ALIKE * verdict.together for deviation in verdict.others])
     good[verdict.longest] = True
     return good
 

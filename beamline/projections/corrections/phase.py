@@ -109,13 +109,13 @@ class Phase:
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None:
             return None, StepDone("", {"phase": "not retrieved"})
-        paganin, said = self.filter_of(source, selection)
+        paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
             paganin.retrieve(views.data, selection.step(Defects).floor)
             return views
 
-        return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(said, {"phase": said})
+        return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
         """The filter for the pixels that the selection makes, and a sentence about it.
@@ -133,26 +133,26 @@ class Phase:
         distance = self.distance_mm
         if distance is None:
             distance = _stated(source) if cone is None else cone[1] - cone[0]
-        known = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
-        if missing := [option for option, value in known.items() if value is None]:
+        values = {"--distance-mm": distance, "--energy-kev": energy, "--pixel-size-um": pitch}
+        if missing := [option for option, value in values.items() if value is None]:
             raise ConfigError(f"--phase needs {' and '.join(missing)}, which {source.path} does not say.")
         assert distance is not None and energy is not None and pitch is not None
         try:
             ratio = self.delta_beta(energy)
         except ValueError as error:
             raise ConfigError(f"--phase paganin:{self.material}: {error}") from error
-        said = f"delta/beta {ratio:.4g} at {energy:g} keV, {distance:g} mm behind the sample"
+        sentence = f"delta/beta {ratio:.4g} at {energy:g} keV, {distance:g} mm behind the sample"
         if cone is not None:
             distance, pitch = distance * cone[0] / (cone[0] + distance), pitch * cone[0] / cone[1]
         paganin = Paganin(length_of(ratio, distance, energy, pitch * selection.binning), self.unsharp)
         if paganin.length > max(source.shape) / selection.binning:
             raise ConfigError(
-                f"--phase: {said}, is a filter over {paganin.length:.4g} pixels; {source.path} has "
+                f"--phase: {sentence}, is a filter over {paganin.length:.4g} pixels; {source.path} has "
                 f"{source.shape[0]} x {source.shape[1]}. Check ratio, energy (keV) and distance (mm)."
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
-        said = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({said}){mask}."
-        return paganin, said
+        sentence = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
+        return paganin, sentence
 
 
 def _stated(source: ScanSource) -> float | None:

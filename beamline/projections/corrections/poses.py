@@ -115,7 +115,7 @@ class ScanPoses:
     def done(self) -> StepDone:
         return StepDone(self.said)
 
-    def known(self, view_ids: I64) -> NDArray[np.bool_]:
+    def stated(self, view_ids: I64) -> NDArray[np.bool_]:
         """[view] whether the file states their pose."""
         return np.isfinite(self.roll[view_ids])
 
@@ -161,8 +161,8 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     n = source.image_key.size
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
-    pivot, said = pivot_of(source, selection), _said(table, shifts)
-    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, said, pivot, selection.binning)
+    pivot, sentence = pivot_of(source, selection), _sentence(table, shifts)
+    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
 
 
 def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:
@@ -193,9 +193,9 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
         ordered = table.keys[order]
         right = np.clip(np.searchsorted(ordered, degrees[views]), 0, ordered.size - 1)
         left = np.maximum(right - 1, 0)
-        wanted = degrees[views]
-        nearest = np.where(np.abs(ordered[left] - wanted) < np.abs(ordered[right] - wanted), left, right)
-        close = np.abs(ordered[nearest] - wanted) <= tolerance
+        angles = degrees[views]
+        nearest = np.where(np.abs(ordered[left] - angles) < np.abs(ordered[right] - angles), left, right)
+        close = np.abs(ordered[nearest] - angles) <= tolerance
         row_of_frame[views[close]] = order[nearest[close]]
     else:
         into = views if table.by == "view" else np.arange(n)
@@ -218,9 +218,9 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     return row_of_frame
 
 
-def require_known(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
+def require_stated(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
     """DataError where views have no pose."""
-    unknown, table = view_ids[~poses.known(view_ids)], stated_poses(source, selection)
+    unknown, table = view_ids[~poses.stated(view_ids)], stated_poses(source, selection)
     if unknown.size and table is not None:
         degrees = np.degrees(source.angles[unknown[0]])
         raise DataError(
@@ -229,7 +229,7 @@ def require_known(poses: ScanPoses, source: ScanSource, selection: Selection, vi
         )
 
 
-def _said(table: PoseTable, shifts: F64) -> str:
+def _sentence(table: PoseTable, shifts: F64) -> str:
     across, down = np.ptp(shifts, axis=0)
     roll, tilt = np.abs(table.turns_deg).max(axis=0)
     return (

@@ -32,13 +32,13 @@ class ReferenceCheck:
     """How darks and flats are checked. `checked_views` and `OpenBeam` ask for it.
 
     Attributes:
-        wanted: "accept": they are used as they are, also saturated, dark, uneven or lit ones.
+        mode: "accept": they are used as they are, also saturated, dark, uneven or lit ones.
     """
 
     name: ClassVar[str] = "references"
     follows: ClassVar[tuple[str, ...]] = ("flags",)
     needs_finished: ClassVar[str] = ""
-    wanted: str = option(
+    mode: str = option(
         "--references",
         "check",
         "check: leave out groups of darks and flats with a fault (saturated, dark, uneven or lit); refuse the scan if "
@@ -48,7 +48,7 @@ class ReferenceCheck:
 
     @property
     def accepted(self) -> bool:
-        return self.wanted == "accept"
+        return self.mode == "accept"
 
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
@@ -208,20 +208,20 @@ def _mean(
 
 def flats_said(source: ScanSource, references: References, current_factor: NDArray[np.float64] | None) -> str:
     """What was done about changes of the beam, in words; empty where nothing was asked."""
-    said = []
+    sentences = []
     if current_factor is not None:
         currents = 1 / current_factor[source.image_key == FrameKind.PROJECTION]
-        said.append(
+        sentences.append(
             f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
         )
     if references.dynamic is not None:
         n = len(references.dynamic.components)
-        said.append(
+        sentences.append(
             f"Flats: {count(n, 'component')} of their changes, weighed for each view (dynamic)."
             if n
             else "Flats: they do not differ by more than noise; their mean is used."
         )
-    return " ".join(said)
+    return " ".join(sentences)
 
 
 def warn_of_parts_without_flats(source: ScanSource, references: References, warn: Warn) -> None:

@@ -100,14 +100,14 @@ class TiltAndLens:
 
     @property
     def needs_finished(self) -> str:
-        said = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
-        return said if self.sought else ""
+        sentence = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
+        return sentence if self.sought else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
         from recon.prep.tilt import STEEPEST
 
-        known = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
-        if (steepest := known.of(part.source, part.selection)) is None:
+        steepest_step = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
+        if (steepest := steepest_step.of(part.source, part.selection)) is None:
             return StepMemory()
         copies = 17 if self.distortion is None else 26
         search = _search_memory(part.source, part.selection) if self.sought else 0
@@ -125,11 +125,11 @@ class TiltAndLens:
         turned = f"Views are turned by {self.tilt_deg:g} degrees." if self.tilt_deg else ""
         return ViewFilter(apply, resampling.reach, "--tilt and --distortion mix"), self.done(turned)
 
-    def done(self, said: str) -> StepDone:
+    def done(self, sentence: str) -> StepDone:
         """What it did, with what is recorded where nothing was asked, too."""
         lens = {} if self.distortion is None else asdict(self.distortion)
-        parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": said} if said else {})}
-        return StepDone(said, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
+        parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": sentence} if sentence else {})}
+        return StepDone(sentence, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
 
     def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
         """How views are resampled; None where they are used as they are.
@@ -188,12 +188,12 @@ def with_tilt(
             f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, more than the "
             f"{math.degrees(STEEPEST):g} that are looked for. Look at the views; give the tilt with --tilt DEGREES."
         )
-    said = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
+    lean = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
-        warn(f"{said}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
+        warn(f"{lean}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
     if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
-        return selection.with_steps(replace(step, tilt=0.0)), f"{said}: not corrected."
-    return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
+        return selection.with_steps(replace(step, tilt=0.0)), f"{lean}: not corrected."
+    return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{lean}; views are turned."
 
 
 def _search_memory(source: ScanSource, selection: Selection) -> int:

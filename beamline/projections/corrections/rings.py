@@ -50,9 +50,9 @@ class Rings:
 
         data, axis_col = views.projections.data, views.geometry.axis_col
         if self.way == "none":
-            said = rings_seen(data, angles, axis_col)
-            return StepDone(said, {"rings": self.way, **({"rings_seen": said} if said else {})})
-        taken, said = remove_rings_in_place(data, angles, self.way, axis_col)
+            sentence = rings_seen(data, angles, axis_col)
+            return StepDone(sentence, {"rings": self.way, **({"rings_seen": sentence} if sentence else {})})
+        stripes, sentence = remove_rings_in_place(data, angles, self.way, axis_col)
         if views.held_out is not None:
-            views.held_out[0][...] -= taken
-        return StepDone(said, {"rings": self.way, **({"rings_removed": said} if said else {})})
+            views.held_out[0][...] -= stripes
+        return StepDone(sentence, {"rings": self.way, **({"rings_removed": sentence} if sentence else {})})

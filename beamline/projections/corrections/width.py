@@ -107,32 +107,32 @@ class Width:
 
         blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
-        told, motion = self._motion(source), _Motion(0.0, 0.0)
+        stated, motion = self._motion(source), _Motion(0.0, 0.0)
         parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
-        if told is not None:
+        if stated is not None:
             leaning = not geometry.is_straight or selection.step(Calibrate).may_lean
             bent = geometry.is_cone or leaning
             if self.arc != "auto":
-                motion = told
-                if bent and told.skew:
-                    found = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
+                motion = stated
+                if bent and stated.skew:
+                    beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
                     raise ConfigError(
                         f"--exposure-arc {self.arc}: rows with angles of their own are known of a straight parallel "
-                        f"beam only, and this is {found}. Give the arc alone. Nothing was written."
+                        f"beam only, and this is {beam}. Give the arc alone. Nothing was written."
                     )
-            elif abs(told.arc) * reach >= _LEAST_PX:
-                motion = _Motion(told.arc, 0.0 if bent else told.skew)
-            elif told.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
-                geometry = replace(geometry, angles=geometry.angles + told.arc / 2)
-                parameters[TO_MIDDLE] = math.degrees(told.arc / 2)
+            elif abs(stated.arc) * reach >= _LEAST_PX:
+                motion = _Motion(stated.arc, 0.0 if bent else stated.skew)
+            elif stated.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
+                geometry = replace(geometry, angles=geometry.angles + stated.arc / 2)
+                parameters[TO_MIDDLE] = math.degrees(stated.arc / 2)
         if not (width or any(motion)):
             return geometry, StepDone(parameters=parameters)
         first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
         seen = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
         seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
         turned = math.degrees(abs(motion.arc)), math.degrees(motion.skew * (rows - 1))
-        said = [
+        statements = [
             *([f"a pixel has its own area{f' and a blur of {blur:g} px' if blur else ''}"] if width else []),
             *([f"a view is the mean over {turned[0]:.3g} degrees ({abs(motion.arc) * reach:.2g} px at the edge of the "
                "field)"] if motion.arc else []),
@@ -141,7 +141,7 @@ class Width:
         parameters |= {
             "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
         }  # fmt: skip
-        return seen, StepDone(f"In the model of the views {', '.join(said)}.", parameters)
+        return seen, StepDone(f"In the model of the views {', '.join(statements)}.", parameters)
 
     def _motion(self, source: ScanSource) -> _Motion | None:
         """Asked for, or told by the file; None: the stage stood, or the file does not say."""

@@ -102,12 +102,12 @@ def _emission(problem: ReconProblem) -> Emission:
     """What was counted, less the lines that weigh nothing."""
     given, weights = problem.use.emission, problem.use.weights
     if given is None:
-        lines, known = masked(problem.projections, weights)
-        known = np.ones_like(lines) if known is None else known
-        counts = np.maximum(lines, 0) * known
+        lines, survival_of_lines = masked(problem.projections, weights)
+        survival_of_lines = np.ones_like(lines) if survival_of_lines is None else survival_of_lines
+        counts = np.maximum(lines, 0) * survival_of_lines
         # Rays of real views may miss the grid, and are not 0: a background explains them.
         floor = np.full_like(counts, max(_FLOOR * float(counts.mean()), float(np.finfo(np.float32).tiny)))
-        return Emission(counts, problem.geometry, known, floor)
+        return Emission(counts, problem.geometry, survival_of_lines, floor)
     if weights is None or weights.all():
         return replace(given, geometry=problem.geometry)
     survival = np.ones_like(given.counts) if given.survival is None else given.survival
