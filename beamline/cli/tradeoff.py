@@ -129,7 +129,7 @@ def tradeoff(
     from beamline.trials.front import TRADEOFF
     from beamline.trials.layout import text
     from beamline.trials.runner import ComparedScan
-    from beamline.trials.tradeoff import Several, TradeoffOptions, planned_tradeoff, run_tradeoff
+    from beamline.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
 
     _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
     if seconds is not None and (volumes is not None or spectra is not None):
@@ -142,7 +142,7 @@ def tradeoff(
         options = TradeoffOptions(
             scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
             methods=methods or (),
-            several=Several(volumes or 0, others, spectra, names_in(states)),
+            several=SeveralVolumes(volumes or 0, others, spectra, names_in(states)),
             depth="quick" if quick else "full",
             max_seconds=max_seconds,
             seconds=seconds,

@@ -43,6 +43,7 @@ class ReturnedView:
 
     @property
     def moved(self) -> bool:
+        """The sample stands elsewhere than in the first view, by more than `MOVED` pixels."""
         return max(abs(x) for x in (self.across, self.down, 0.0) if math.isfinite(x)) > MOVED
 
     def said(self) -> str:

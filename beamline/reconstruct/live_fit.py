@@ -11,7 +11,7 @@ how far the fit has come in the file.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from enum import Enum, auto
 
 import numpy as np
@@ -23,27 +23,25 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import PlaceStep, RayStep, ScanStep
+from beamline.projections.protocols import PlaceStep, ScanStep
 from beamline.projections.refusals import checked_views, correction_blockers, refuse
 from beamline.projections.registry import in_order
-from beamline.projections.selection import check_axis, geometry_of
+from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
+from beamline.reconstruct.followed_views import Cursor, FollowedViews
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
-from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
-from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
 from recon.splatting.stream import StreamingFit
@@ -68,40 +66,6 @@ class FollowState(Enum):
     ENDED = auto()
 
 
-@dataclass(frozen=True, eq=False)
-class Cursor:
-    """How far the fit has come in the file.
-
-    Attributes:
-        frames: in the file at the last look.
-        taken: of them, those that were corrected, or are not views.
-        part: of the file, whose views were corrected last.
-        batches: line integrals of the views that are corrected for good: what the volume grows from.
-        newest: the view after them, provisional: it is in the fit already, and is corrected again with the next one.
-    """
-
-    frames: int = 0
-    taken: int = 0
-    part: int = 0
-    batches: tuple[Projections, ...] = ()
-    newest: Projections | None = None
-
-    @property
-    def behind(self) -> bool:
-        """The file has frames that were not taken yet."""
-        return self.taken < self.frames
-
-    @property
-    def n_corrected(self) -> int:
-        """Views in `batches`."""
-        return sum(batch.view_ids.size for batch in self.batches)
-
-    @property
-    def view_ids(self) -> NDArray[np.int64]:
-        """Frames of the file of the views in `batches`."""
-        return np.concatenate([batch.view_ids for batch in self.batches])
-
-
 class ScanFollower:
     """A scan's file and the volume that grows with it. The caller decides when to look, to fit and to finish."""
 
@@ -109,7 +73,7 @@ class ScanFollower:
         self.source = source
         self.state = FollowState.WAITS_FOR_REFERENCES
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self._cursor = Cursor()
+        self._views, self._cursor = FollowedViews(source, options.selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
         self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None  # None: waits for references
@@ -126,6 +90,7 @@ class ScanFollower:
 
     @property
     def n_views(self) -> int:
+        """Views in the file, those with a flag among them."""
         return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
 
     @property
@@ -143,7 +108,7 @@ class ScanFollower:
         assert self.state is not FollowState.ENDED
         n = self.source.refresh()
         grown = n > self._cursor.frames
-        views = self._chosen(self._usable().frames)
+        views = self._views.chosen(self._views.usable().frames)
         self._cursor = replace(self._cursor, frames=n, taken=self._cursor.taken if views.size else n)
         if views.size:
             self._step(views, ended)
@@ -190,7 +155,7 @@ class ScanFollower:
         if abs(self.axis_col - before) > _AXIS_MOVES:
             self._fit = None
         else:
-            self._fit.move_axis(self._binned(self.axis_col))
+            self._fit.move_axis(self._views.template(self.axis_col).axis_col)
 
     def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
         """Feed the fit with the next views, all of one part of the file: other parts have references of their own."""
@@ -215,7 +180,7 @@ class ScanFollower:
         self._cursor = replace(self._cursor, part=part)
         self._settle_newest()
         if self._cursor.batches:
-            self._correct_again(self._usable(), _NEXT_PART)
+            self._correct_again(self._views.usable(), _NEXT_PART)
         else:
             self._correction = self._correction.renewed()
 
@@ -241,15 +206,6 @@ class ScanFollower:
             self._cursor = replace(self._cursor, newest=newest)
             self._fit.add_views(newest.data, self._angles(newest.view_ids))
 
-    def _usable(self) -> UsableViews:
-        return usable_views(self.source, self._options.selection.step(Flags).used)
-
-    def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The views of the selection, by their place among all views taken, which later frames do not change."""
-        taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
-        chosen = parse_views(self._options.selection.views, np.zeros(taken.size))
-        return frames[np.isin(frames, taken[chosen])]
-
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
         while self._cursor.behind:
@@ -258,34 +214,18 @@ class ScanFollower:
                 return
             self.take_new_frames(ended=True)
 
-    def _binned(self, axis_col: float) -> float:
-        return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
-
-    def _seen(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, dict[str, StepDone]]:
-        """The geometry of views with the motion of the stage in their exposures, and what its steps did."""
-        selection, done = self._options.selection, dict[str, StepDone]()
-        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[view_ids])
-        for step in in_order(selection):
-            if isinstance(step, RayStep):
-                geometry, done[step.name] = step.rays(self.source, selection, geometry)
-        return geometry, done
-
-    def _angles(self, view_ids: NDArray[np.int64], axis_col: float | None = None) -> NDArray[np.float64]:
-        """Angles of views for the fit: in the middle of the exposure, of the middle row. The fit knows no motion."""
-        column = self.axis_col if axis_col is None else axis_col
-        assert column is not None  # the fit has an axis
-        geometry, _ = self._seen(column, view_ids)
-        return np.asarray(geometry.angles + geometry.skew * (geometry.detector_shape[0] - 1) / 2)
+    def _angles(self, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        assert self.axis_col is not None  # the fit has an axis
+        return self._views.angles(self.axis_col, view_ids)
 
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
-        template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
         options, again = self._options, bool(self._history)
         now = self._clock.now()
         self._sink(ReconStarted(self.source.path, options.method.name, self.n_views, axis_col, again, time=now))
-        fit = options.streaming.stream(template, options.seed, self._clock.now)
+        fit = options.streaming.stream(self._views.template(axis_col), options.seed, self._clock.now)
         for batch in self._cursor.batches:
-            fit.add_views(batch.data, self._angles(batch.view_ids, axis_col))
+            fit.add_views(batch.data, self._views.angles(axis_col, batch.view_ids))
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
         return fit
 
@@ -429,7 +369,7 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        geometry, seen = self._seen(axis_col, projections.view_ids)
+        geometry, seen = self._views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}

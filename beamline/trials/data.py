@@ -23,7 +23,7 @@ _MAPPED = ("projections", "weights", *(f"emission.{name}" for name in _COUNTED))
 
 
 @dataclass(frozen=True, eq=False)
-class Data:
+class TrialData:
     """What every trial of a scan shares.
 
     Attributes:
@@ -97,7 +97,7 @@ class Data:
             write_array(folder / f"{name}.npy", array)
 
     @classmethod
-    def load(cls, folder: Path) -> Data:
+    def load(cls, folder: Path) -> TrialData:
         """What `save` wrote; views and their weights stay in the files until they are used."""
         arrays = {
             path.stem: np.load(path, mmap_mode="r" if path.stem in _MAPPED else None, allow_pickle=False)
@@ -144,7 +144,7 @@ def write_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def geometry_in(folder: Path) -> Geometry:
-    """The geometry of what `Data.save` wrote, without its views."""
+    """The geometry of what `TrialData.save` wrote, without its views."""
     return _geometry("geometry", folder)
 
 

@@ -14,7 +14,7 @@ from beamline.core.machine import free_memory
 from beamline.core.sinks import Warn
 from beamline.core.text import count, size
 from beamline.trials.cost import expected_seconds, sweep_seconds
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.runner import Planned
 from beamline.trials.trial import Trial
 from recon.assess.time_model import duration_text
@@ -86,7 +86,7 @@ class ExpectedRun:
 
 
 def dry_run(
-    plan: Callable[[Warn], tuple[Data, Planned]],
+    plan: Callable[[Warn], tuple[TrialData, Planned]],
     folder: Path,
     warn: Warn,
     now: Callable[[], float] = time.process_time,
@@ -115,7 +115,7 @@ def dry_run(
     return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())
 
 
-def _memory(trial: Trial, data: Data, own_bytes: int) -> int | None:
+def _memory(trial: Trial, data: TrialData, own_bytes: int) -> int | None:
     """Bytes: of a process that has loaded the libraries, the views twice (in their file and those used), the rest."""
     if trial.joint is not None:
         return None
@@ -124,6 +124,6 @@ def _memory(trial: Trial, data: Data, own_bytes: int) -> int | None:
     return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
 
 
-def _bytes(data: Data) -> int:
+def _bytes(data: TrialData) -> int:
     arrays = (data.projections, data.weights, data.truth, data.held_out and data.held_out[0])
     return sum(array.nbytes for array in arrays if array is not None)

@@ -158,9 +158,9 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
     panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
     figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
     for axes, (label, value) in zip(panels, values.items(), strict=False):
-        for method, found in _by_method(table, value).items():
-            places = [rows.index(outcome.trial.choice.label) for outcome, _ in found if outcome.trial.choice]
-            axes.plot(places, [v for _, v in found], marker="o", ms=4, lw=0.8, color=colour_of(method), label=method)
+        for method, pairs in _by_method(table, value).items():
+            places = [rows.index(outcome.trial.choice.label) for outcome, _ in pairs if outcome.trial.choice]
+            axes.plot(places, [v for _, v in pairs], marker="o", ms=4, lw=0.8, color=colour_of(method), label=method)
         axes.set_ylabel(label, fontsize=8)
         axes.set_xticks(range(len(rows)), rows, rotation=90, fontsize=6.5)
         axes.tick_params(axis="y", labelsize=7)
@@ -174,10 +174,10 @@ def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
     figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
     by_dose, by_time = figure.subplots(1, 2, sharey=True)
     a_frame, dose = dose_scale(table.light)
-    for method, found in _by_method(table, value).items():
-        doses, times = ([o.trial.frames * a_frame for o, _ in found], [o.cpu_seconds for o, _ in found])
+    for method, pairs in _by_method(table, value).items():
+        doses, times = ([o.trial.frames * a_frame for o, _ in pairs], [o.cpu_seconds for o, _ in pairs])
         for axes, cost in ((by_dose, doses), (by_time, times)):
-            axes.plot(cost, [v for _, v in found], "o", ms=4, color=colour_of(method), label=method)
+            axes.plot(cost, [v for _, v in pairs], "o", ms=4, color=colour_of(method), label=method)
     by_dose.set(xlabel=dose, ylabel=label, xscale="log")
     by_time.set(xlabel="processor time (s)", xscale="log")
     for axes in (by_dose, by_time):
@@ -188,12 +188,12 @@ def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
 
 def _by_method(table: TrialTable, value: Value) -> dict[str, list[tuple[Outcome, float]]]:
     """The rows of each method that have a finite value."""
-    found: dict[str, list[tuple[Outcome, float]]] = {}
+    pairs_of: dict[str, list[tuple[Outcome, float]]] = {}
     for outcome in table.compared:
-        of_row, rows = value(outcome), found.setdefault(outcome.trial.method, [])
+        of_row, rows = value(outcome), pairs_of.setdefault(outcome.trial.method, [])
         if of_row is not None and math.isfinite(of_row):
             rows.append((outcome, of_row))
-    return found
+    return pairs_of
 
 
 def colour_of(method: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -35,7 +35,7 @@ class SharedFit(Protocol):
     def work(self) -> float:
         """A rough measure of the time of a view, to be compared among settings of the same fit only."""
 
-    def fit(self, data: Data, seed: int, **given: Any) -> VolumeAt:
+    def fit(self, data: TrialData, seed: int, **given: Any) -> VolumeAt:
         """Fit the volumes. `given`: other arguments of the function in recon.
 
         Raises:
@@ -45,7 +45,7 @@ class SharedFit(Protocol):
     def toy(self) -> Self:
         """The same fit with as little work as still runs its kernels."""
 
-    def toy_data(self, geometry: Geometry) -> Data:
+    def toy_data(self, geometry: Geometry) -> TrialData:
         """Small views by the same kind of beam, with times or energies as the fit needs them."""
 
 
@@ -60,7 +60,7 @@ class SeriesFit:
     def work(self) -> float:
         return float(self.volumes * MOTION[self.motion][1])
 
-    def fit(self, data: Data, seed: int, **given: Any) -> VolumeAt:
+    def fit(self, data: TrialData, seed: int, **given: Any) -> VolumeAt:
         lines, weights = _measured_lines(data)
         timed = TimedViews(lines, data.geometry, data.shown[: data.geometry.n_views], weights)
         return fit_series(timed, self.volumes, motion=MOTION[self.motion][0], seed=seed, **given).at
@@ -68,9 +68,9 @@ class SeriesFit:
     def toy(self) -> Self:
         return replace(self, volumes=2, motion="learnt" if MOTION[self.motion][0] is None else self.motion)
 
-    def toy_data(self, geometry: Geometry) -> Data:
+    def toy_data(self, geometry: Geometry) -> TrialData:
         lines, views = _copies_of_toy(geometry)
-        return Data(lines, views, None, None, of_view=np.arange(views.n_views, dtype=np.float64))
+        return TrialData(lines, views, None, None, of_view=np.arange(views.n_views, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class MaterialsFit:
     def work(self) -> float:
         return 1.0 + self.share
 
-    def fit(self, data: Data, seed: int, **given: Any) -> VolumeAt:
+    def fit(self, data: TrialData, seed: int, **given: Any) -> VolumeAt:
         sections = data.sections
         if sections is None:
             raise ValueError("views of one energy show no materials: expected scans at several energies")
@@ -98,18 +98,18 @@ class MaterialsFit:
     def toy(self) -> Self:
         return self
 
-    def toy_data(self, geometry: Geometry) -> Data:
+    def toy_data(self, geometry: Geometry) -> TrialData:
         lines, views = _copies_of_toy(geometry)
         energies = np.arange(views.n_views, dtype=np.float64) % 2
         sections = np.array([[1, 0.5], [0.5, 1]])
-        return Data(lines, views, None, None, of_view=energies, sections=sections, states=(0, 1))
+        return TrialData(lines, views, None, None, of_view=energies, sections=sections, states=(0, 1))
 
 
 JOINT: Mapping[str, Callable[..., SharedFit]] = {"series": SeriesFit, "materials": MaterialsFit}
 """By the name that a table gives to the method."""
 
 
-def _measured_lines(data: Data) -> tuple[F32, F32 | None]:
+def _measured_lines(data: TrialData) -> tuple[F32, F32 | None]:
     """Line integrals [view, row, col] of the views used, 0 where nothing was measured, and their weights."""
     weights = None if data.weights is None else data.weights[: data.geometry.n_views]
     return data.projections if weights is None else np.where(weights > 0, data.projections, np.float32(0)), weights
@@ -123,7 +123,7 @@ def _copies_of_toy(geometry: Geometry) -> tuple[F32, Geometry]:
     return np.tile(lines, (_TOYS, 1, 1)), copies
 
 
-def by_parts(count: int, data: Data, fit: PartFit) -> VolumeAt:
+def by_parts(count: int, data: TrialData, fit: PartFit) -> VolumeAt:
     """A volume of each part of the views: of each energy, or of so long, with linear change between their middles."""
     n = data.geometry.n_views
     shown = data.shown[:n]

@@ -28,9 +28,9 @@ def front(
         better: whether the quality of the first point is clearly above that of the second, which costs less. Where it
             is not, the second one beats the first. None: by any difference.
     """
-    known = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
+    finite = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
     kept: list[int] = []
-    for i in sorted(known, key=lambda i: (costs[i], -qualities[i], i)):
+    for i in sorted(finite, key=lambda i: (costs[i], -qualities[i], i)):
         if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
             kept.append(i)
     return kept

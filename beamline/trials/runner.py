@@ -24,7 +24,7 @@ from beamline.reconstruct.outcome import facts_of
 from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from beamline.trials.cost import expected_seconds
-from beamline.trials.data import Data, write_array
+from beamline.trials.data import TrialData, write_array
 from beamline.trials.launch import DATA, compile_kernels, run_trial
 from beamline.trials.layout import TableLayout, event_of, write_page, write_table
 from beamline.trials.plans import Timed, seconds_left
@@ -159,7 +159,7 @@ class _Rig:
 
 
 def run_comparison(
-    plan: Callable[[Warn], tuple[Data, Planned]],
+    plan: Callable[[Warn], tuple[TrialData, Planned]],
     limits: RunLimits,
     sink: Sink,
     clock: Clock,

@@ -19,7 +19,7 @@ from beamline.core.sinks import Warn
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS, Metric
 from beamline.report.slice_sheet import SliceSheet
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.figures import against_cost, figures_of_rows
 from beamline.trials.front import dose_columns
 from beamline.trials.layout import TableColumn, records
@@ -71,7 +71,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     return run_comparison(partial(planned_study, options), limits, sink, clock, now)
 
 
-def planned_study(options: StudyOptions, warn: Warn) -> tuple[Data, Planned]:
+def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned]:
     """Read and correct the views, and choose those of each row.
 
     Raises:
@@ -103,7 +103,7 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[Data, Planned]:
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
     reference = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
-    data = Data(prepared.projections.data, geometry, None, opened.truth, prepared.rays_there(), prepared.emission)
+    data = TrialData(prepared.projections.data, geometry, None, opened.truth, prepared.rays_there(), prepared.emission)
     started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
     return data, Planned(table, StudyLayout(options.study), started, reference)
 

@@ -67,10 +67,12 @@ class TrialTable:
     notes: Sequence[str] = ()
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
+        """The table with this outcome in place of the one of this number."""
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
 
     @property
     def n_done(self) -> int:
+        """Trials that have a volume."""
         return sum(outcome.status == "done" for outcome in self.outcomes)
 
     @property
@@ -80,7 +82,7 @@ class TrialTable:
 
     @property
     def dose(self) -> TrialCost:
-        """Each frame of the scan that several views share is counted once."""
+        """The dose as a cost. Each frame of the scan that several views share is counted once."""
         a_frame, axis = dose_scale(self.light)
         unit = "frames" if self.light is None else "photons" if self.light.gray is None else "Gy"
         return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.frames), unit)
@@ -97,6 +99,7 @@ class TrialTable:
 
     @property
     def quality(self) -> Quality:
+        """The measure of quality, with its words."""
         return QUALITIES[self.by]
 
     @property
@@ -127,9 +130,9 @@ class TrialTable:
         Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
         noise of a view is in both of its residuals, and so not in their difference.
         """
-        left = [np.asarray(self.compared[k].left) for k in (i, j)]
-        if not self.quality.of_views or min(each.size for each in left) < 2 or left[0].size != left[1].size:
+        squared = [np.asarray(self.compared[k].squared_residuals) for k in (i, j)]
+        if not self.quality.of_views or min(each.size for each in squared) < 2 or squared[0].size != squared[1].size:
             return LEAST_GAIN
-        apart, level = left[0] - left[1], (left[0].mean() + left[1].mean()) / 2
+        apart, level = squared[0] - squared[1], (squared[0].mean() + squared[1].mean()) / 2
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN

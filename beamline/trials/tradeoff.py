@@ -23,7 +23,7 @@ from beamline.reconstruct.energy_views import energy_views, read_spectra
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.time_series import times_of
 from beamline.storage.readers.open import SourceOptions
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.front import TRADEOFF
 from beamline.trials.plans import Depth, plan, plan_in_equal_time, plan_in_time, plan_of_energies, telling_first
 from beamline.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
@@ -42,7 +42,7 @@ _WITH_JOINT = ("fbp", "fista-tv", "r2")  # beside joint fits, where no methods a
 
 
 @dataclass(frozen=True)
-class Several:
+class SeveralVolumes:
     """How views show several volumes.
 
     Attributes:
@@ -71,7 +71,7 @@ class TradeoffOptions:
 
     scan: ComparedScan
     methods: Sequence[str]
-    several: Several = field(default_factory=Several)
+    several: SeveralVolumes = field(default_factory=SeveralVolumes)
     depth: Depth = "quick"
     max_seconds: float | None = None
     seconds: float | None = None
@@ -91,7 +91,7 @@ def run_tradeoff(
     return run_comparison(partial(planned_tradeoff, options), limits, sink, clock, now, begun)
 
 
-def planned_tradeoff(options: TradeoffOptions, warn: Warn) -> tuple[Data, Planned]:
+def planned_tradeoff(options: TradeoffOptions, warn: Warn) -> tuple[TrialData, Planned]:
     """Read and correct the views, hold some out, and plan the trials.
 
     Raises:
@@ -114,7 +114,7 @@ def _table(options: TradeoffOptions, facts: Mapping[str, str], length_unit: str,
     return TrialTable((), "psnr", length_unit, machine(), facts, options.command, light=light)
 
 
-Comparison = tuple[Data, Sequence[Trial], TrialTable]
+Comparison = tuple[TrialData, Sequence[Trial], TrialTable]
 
 
 def _of_one_volume(options: TradeoffOptions, warn: Warn) -> Comparison:
@@ -129,7 +129,7 @@ def _of_one_volume(options: TradeoffOptions, warn: Warn) -> Comparison:
     return data, trials, _table(options, facts, opened.prepared.length_unit, opened.light)
 
 
-def split(prepared: PreparedProjections, truth: F32 | None) -> Data:
+def split(prepared: PreparedProjections, truth: F32 | None) -> TrialData:
     """The views that trials use, and the views held out that judge all trials if there is no truth.
 
     Raises:
@@ -139,7 +139,7 @@ def split(prepared: PreparedProjections, truth: F32 | None) -> Data:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     others = 0 if prepared.held_out is None else prepared.held_out[1].n_views
     rays = prepared.rays_there(others)
-    return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth, rays, prepared.emission)
+    return TrialData(prepared.projections.data, prepared.geometry, prepared.held_out, truth, rays, prepared.emission)
 
 
 def _in_time(options: TradeoffOptions, volumes: int, warn: Warn) -> Comparison:
@@ -171,7 +171,7 @@ def _of_energies(options: TradeoffOptions, spectra_file: Path, warn: Warn) -> Co
     energies, held_out = len(views.cross_sections), views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2
     used, unseen = np.flatnonzero(~held_out), np.flatnonzero(held_out)
     order, geometry = np.concatenate((used, unseen)), views.geometry.select(used)
-    data = Data(
+    data = TrialData(
         views.projections[used], geometry, (views.projections[unseen], views.geometry.select(unseen)), None,
         None if views.weight is None else views.weight[order],
         of_view=views.energy[order].astype(np.float64), sections=views.cross_sections, states=states,

@@ -100,9 +100,9 @@ class Trial:
             return self.label
         if self.group == "method":
             return by_name(self.method).label
-        told = {} if self.joint is None else self.settings
+        settings = {} if self.joint is None else self.settings
         parts = [f"{self.parts} parts"] if self.parts > 1 else []
-        return ", ".join([self.method, *parts, *(_in_words(name, value) for name, value in told.items())])
+        return ", ".join([self.method, *parts, *(_in_words(name, value) for name, value in settings.items())])
 
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table, JSON or an event."""
@@ -117,6 +117,7 @@ class Trial:
 
     @classmethod
     def of_job(cls, job: Mapping[str, Any]) -> Self:
+        """The trial that `as_job` wrote."""
         choice = job["choice"] and ViewChoice(job["choice"]["label"], np.array(job["choice"]["groups"], np.int64))
         return cls(**{**job, "choice": choice})
 
@@ -166,7 +167,7 @@ class Outcome:
         curve: (seconds, dB) of its own record of the residual.
         curve_of: which views that record is of, in words.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
-        left: squared residual of each view held out.
+        squared_residuals: of each view held out.
         reached: how far it came, such as "212 steps, 8 sweeps"; empty for a direct method.
     """
 
@@ -180,7 +181,7 @@ class Outcome:
     curve_of: str = ""
     message: str = ""
     cpu_seconds: float = math.nan
-    left: Sequence[float] = ()
+    squared_residuals: Sequence[float] = ()
     reached: str = ""
 
     def quality(self, by: str) -> float:
@@ -223,4 +224,5 @@ QUALITIES: Mapping[str, Quality] = {
 
 
 def thousands(n: int) -> str:
+    """A number of Gaussians in words, in thousands from 1000 on."""
     return f"{n / 1000:.3g}k Gaussians" if n >= 1000 else f"{n} Gaussians"

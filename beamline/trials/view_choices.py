@@ -49,6 +49,7 @@ class ViewChoice:
 
     @property
     def n_views(self) -> int:
+        """Views that it makes; 0 where it is left out."""
         return 0 if self.groups is None else self.groups.shape[0]
 
 
@@ -94,7 +95,7 @@ def fixed_views(views: ViewSet) -> list[ViewChoice]:
 def sector(views: ViewSet) -> list[ViewChoice]:
     """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
     falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
-    equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, own in SECTORS if n != own]
+    equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, count in SECTORS if n != count]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
 
 
@@ -143,10 +144,10 @@ def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, fami
     """The row of a selection in the words of `parse_views`; `within`: its angles are those within a period."""
     angles = np.mod(views.angles, views.period) if within else views.angles
     try:
-        found = parse_views(spec, angles, period=views.period)
+        numbers = parse_views(spec, angles, period=views.period)
     except ValueError as error:
         return ViewChoice(label, None, family, str(error))
-    return ViewChoice(label, found[:, None], family)
+    return ViewChoice(label, numbers[:, None], family)
 
 
 def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:

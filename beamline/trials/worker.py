@@ -30,7 +30,7 @@ from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
-from beamline.trials.data import Data, geometry_in, write_array
+from beamline.trials.data import TrialData, geometry_in, write_array
 from beamline.trials.joint import VolumeAt, by_parts
 from beamline.trials.trial import Trial
 from recon.assess import metrics
@@ -54,7 +54,7 @@ _SAY_EVERY = 0.5  # s
 
 def run(
     trial: Trial,
-    data: Data,
+    data: TrialData,
     seed: int,
     say: Say,
     now: Callable[[], float] = time.perf_counter,
@@ -94,16 +94,16 @@ def run(
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
-    found, left = measured(volume_at, data, grid, keep)
+    figures, squared = measured(volume_at, data, grid, keep)
     if trial.halves and trial.views >= 4:
-        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
+        figures["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
     return {
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "peak_bytes": peak,
-        "metrics": {name: float(value) for name, value in found.items()},
+        "metrics": {name: float(value) for name, value in figures.items()},
         "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
-        "left": left,
+        "squared_residuals": squared,
         "curve": [] if result is None else curve_of(result),
         "curve_of": "" if judged is None else judged.views,
         "reached": "" if result is None else reached(result),
@@ -111,30 +111,32 @@ def run(
     }
 
 
-def measured(volume_at: VolumeAt, data: Data, grid: Grid, keep: Path | None) -> tuple[dict[str, float], list[float]]:
+def measured(
+    volume_at: VolumeAt, data: TrialData, grid: Grid, keep: Path | None
+) -> tuple[dict[str, float], list[float]]:
     """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
-    n, found, left = data.geometry.n_views, dict[str, float](), list[float]()
+    n, figures, squared = data.geometry.n_views, dict[str, float](), list[float]()
     middle = volume_at(float(np.sort(data.shown[:n])[n // 2]))
     if keep is not None:
         write_array(keep, middle)
     if data.truth is not None:
-        found = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
+        figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
         if data.emission is not None:
-            found |= metrics.contrast(data.truth, middle)
+            figures |= metrics.contrast(data.truth, middle)
     if data.reference is not None:
-        found["psnr_fbp"] = metrics.psnr(data.reference, middle)
-        found["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
+        figures["psnr_fbp"] = metrics.psnr(data.reference, middle)
+        figures["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
     if data.regions is not None:
-        found["snr"], found["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
+        figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
     if data.held_out is not None:
         unseen, geometry = data.held_out
         root = np.float32(1) if data.rays_held_out is None else np.sqrt(data.rays_held_out)
         off = root * (shown(volume_at, data.shown[n:], geometry, grid) - unseen)
         if (scale := float(np.linalg.norm(root * unseen))) == 0:
             raise ValueError("the views held out are all zero, so there is nothing to explain")
-        found["residual_held_out"] = float(np.linalg.norm(off)) / scale
-        left = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
-    return found, left
+        figures["residual_held_out"] = float(np.linalg.norm(off)) / scale
+        squared = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
+    return figures, squared
 
 
 def _always(volume: F32, key: float) -> F32:
@@ -155,7 +157,7 @@ def ready(trial: Trial, geometry: Geometry) -> None:
         warm_up(trial.build(), geometry)
 
 
-def _several(trial: Trial, data: Data, grid: Grid, seed: int) -> VolumeAt:
+def _several(trial: Trial, data: TrialData, grid: Grid, seed: int) -> VolumeAt:
     if (joint := trial.joint) is not None:
         return joint.fit(data, seed)
 
@@ -169,11 +171,11 @@ def _several(trial: Trial, data: Data, grid: Grid, seed: int) -> VolumeAt:
 
 def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
     """Line integrals [view, row, col] of the volume that each view shows, by its time or the number of its energy."""
-    found = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
+    lines = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
     for key in np.unique(of_view):
         at = np.flatnonzero(of_view == key)
-        found[at] = project(Volume(volume_at(float(key)), grid), geometry.select(at))
-    return found
+        lines[at] = project(Volume(volume_at(float(key)), grid), geometry.select(at))
+    return lines
 
 
 def half_set_resolution(
@@ -303,7 +305,7 @@ def main(job: Path) -> int:
     trial = Trial.of_job(request["trial"])
     keep = request.get("keep")
     try:
-        data = Data.load(Path(request["data"]))
+        data = TrialData.load(Path(request["data"]))
         result = run(trial, data, int(request["seed"]), say, keep=None if keep is None else Path(keep))
     except ValueError as error:
         say({"event": "failed", "message": str(error)})

@@ -23,7 +23,7 @@ from recon.base.volume import Grid, Volume
 from recon.fields.networks import Field
 from recon.fields.rays import Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume, leaves_the_field
-from recon.splatting.train import split_views
+from recon.splatting.train import used_and_kept_back
 from recon.voxels.voxel_problem import iterative_memory
 
 CHUNK = 2**15  # Samples that one pass through the network takes
@@ -156,7 +156,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
         raise ValueError(f"device {problem.device!r} cannot be used: {error}. Give 'cpu', or 'cuda'") from error
     if geometry.width:
         warnings.warn(f"a neural field takes rays without a width: it does not know {geometry.width}", stacklevel=2)
-    used, kept = split_views(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
+    used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
     grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))

@@ -145,7 +145,7 @@ class _Views:
                 stacklevel=3,
             )
             geometry = geometry.seen_with(NO_WIDTH)
-        used, kept_back = split_views(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
+        used, kept_back = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         data, weights = masked(problem.projections, problem.use.weights)
         if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
             weights = weights / np.float32(_usual(weights, data))
@@ -445,7 +445,14 @@ def _usual(weights: F32, data: F32) -> float:
     return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
 
 
-def split_views(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def used_and_kept_back(
+    n_views: int, held_out: tuple[int, ...], early_stop: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Numbers of the views that a fit sees, and of those held out, ascending.
+
+    Raises:
+        ValueError: numbers that name no view, or all of them; none where `early_stop` needs some.
+    """
     if any(isinstance(view, bool | np.bool_) for view in held_out):
         raise ValueError("held_out must be the numbers of views, got a mask of booleans: use numpy.flatnonzero of it")
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))

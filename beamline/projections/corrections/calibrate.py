@@ -109,6 +109,7 @@ class Calibrate:
         geometry_before: GeometryOf,
         progress: Callable[[int, int], None],
     ) -> Calibrated:
+        """The geometry of these frames as `calibrated` learns it, by the step's own terms."""
         return calibrated(source, selection, frames, geometry_before, self.geometry, progress)
 
     def apply(

@@ -51,10 +51,12 @@ class Flags:
 
     @property
     def used(self) -> bool:
+        """Views are treated by flags, the file's or new ones."""
         return self.mode != "ignore"
 
     @property
     def judged(self) -> bool:
+        """The monitor looks at the frames first."""
         return self.mode == "judge"
 
     @property

@@ -48,6 +48,7 @@ class ReferenceCheck:
 
     @property
     def accepted(self) -> bool:
+        """All groups are used, whatever their faults."""
         return self.mode == "accept"
 
     def memory(self, part: ScanPart) -> StepMemory:

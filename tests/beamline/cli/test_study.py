@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 from beamline.cli.main import main
 from beamline.report.slice_sheet import SliceSheet
 from beamline.trials import runner
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.launch import DATA
 from beamline.trials.trial import Outcome, Trial
 from beamline.trials.worker import measured
@@ -33,12 +33,12 @@ def _beamline(*arguments: str) -> Result:
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, Data]]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
-    found: list[tuple[Trial, Data]] = []
+    found: list[tuple[Trial, TrialData]] = []
 
     def trial(trial: Trial, work: Path, seed: int, limit: float | None, *, keep: Path) -> Outcome:
-        data = Data.load(work / DATA)
+        data = TrialData.load(work / DATA)
         grid = Grid.matching(data.geometry)
         truth = SCAN.truth(grid)
         figures, _ = measured(lambda key: truth + np.float32(ERROR) if found else truth, data, grid, keep)

@@ -20,7 +20,7 @@ from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.runner import ComparedScan
 from beamline.trials.tradeoff import TradeoffOptions, run_tradeoff, split
 from beamline.trials.trial import Trial
@@ -144,7 +144,7 @@ def test_a_trial_gives_what_the_function_gives_of_the_same_counts(pet: Path, tmp
     for given, views in ((truth, 24), (truth, 12), (None, 21)):
         data = split(prepared, given)
         data.save(tmp_path / "data.npz")
-        loaded = Data.load(tmp_path / "data.npz")
+        loaded = TrialData.load(tmp_path / "data.npz")
         trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3}, halves=True)
         found = run(trial, loaded, 0, lambda _: None, keep=tmp_path / "volume.npy")
         ids = (prepared if given is not None else hold_out(prepared, 8, advice="")).projections.view_ids
@@ -194,7 +194,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     groups = np.arange(24).reshape(12, 2)
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
-    data = Data(prepared.projections.data, prepared.geometry, None, None, None, prepared.emission)
+    data = TrialData(prepared.projections.data, prepared.geometry, None, None, None, prepared.emission)
     settings: dict[str, int] = {"iterations": 2, "subsets": 3}
     row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups))
     run(row, data, 0, print, keep=tmp_path / "volume.npy")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.trials import joint, worker
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.joint import MaterialsFit, SeriesFit, by_parts
 from beamline.trials.plans import plan_in_time, plan_of_energies, work
 from beamline.trials.trial import Trial
@@ -47,7 +47,7 @@ def discs() -> F32:
     return np.repeat(np.stack(both)[:, None], ROWS, 1).astype(np.float32)
 
 
-def data_of(weights: tuple[np.ndarray, ...], of_view: np.ndarray, **given: object) -> Data:  # type: ignore[type-arg]
+def data_of(weights: tuple[np.ndarray, ...], of_view: np.ndarray, **given: object) -> TrialData:  # type: ignore[type-arg]
     """Views of sums of two discs with the weights of each view; the last five are held out."""
     angles = np.mod(np.arange(VIEWS + HELD_OUT) * 2.4, np.pi)
     geometry = Geometry.parallel(angles, (ROWS, SIDE))
@@ -56,18 +56,18 @@ def data_of(weights: tuple[np.ndarray, ...], of_view: np.ndarray, **given: objec
     seen = sum(line * weight[:, None, None] for line, weight in zip(lines, weights, strict=True)).astype(np.float32)
     used, unseen = np.arange(VIEWS), np.arange(VIEWS, VIEWS + HELD_OUT)
     held = seen[unseen], geometry.select(unseen)
-    return Data(seen[used], geometry.select(used), held, None, of_view=of_view, **given)  # type: ignore[arg-type]
+    return TrialData(seen[used], geometry.select(used), held, None, of_view=of_view, **given)  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def in_time() -> Data:
+def in_time() -> TrialData:
     """The first disc fades while the second grows; views held out are of moments between the others."""
     times = np.concatenate((np.linspace(0, 10, VIEWS), np.linspace(1, 9, HELD_OUT)))
     return data_of((1 - times / 10, times / 10), times)
 
 
 @pytest.fixture
-def of_energies() -> Data:
+def of_energies() -> TrialData:
     energy = np.arange(VIEWS + HELD_OUT) % 2
     shares = SECTIONS[energy]
     return data_of((shares[:, 0], shares[:, 1]), energy.astype(np.float64), sections=SECTIONS, states=(0, 1))
@@ -77,7 +77,7 @@ def plain_fbp(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
     return fbp(projections, geometry)
 
 
-def test_parts_in_time_are_linear_between_their_middles(in_time: Data) -> None:
+def test_parts_in_time_are_linear_between_their_middles(in_time: TrialData) -> None:
     order = np.random.default_rng(0).permutation(VIEWS)
     mixed = replace(
         in_time, projections=in_time.projections[order], geometry=in_time.geometry.select(order),
@@ -91,7 +91,7 @@ def test_parts_in_time_are_linear_between_their_middles(in_time: Data) -> None:
         np.testing.assert_allclose(volume_at(float(time)), expected, atol=1e-6)
 
 
-def test_parts_of_energies_are_one_an_energy(of_energies: Data) -> None:
+def test_parts_of_energies_are_one_an_energy(of_energies: TrialData) -> None:
     volume_at = by_parts(2, of_energies, plain_fbp)
     for energy in (0, 1):
         own = np.flatnonzero(of_energies.shown[:VIEWS] == energy)
@@ -99,20 +99,20 @@ def test_parts_of_energies_are_one_an_energy(of_energies: Data) -> None:
         np.testing.assert_array_equal(volume_at(float(energy)), expected)
 
 
-def test_one_fit_in_time_is_that_of_recon(in_time: Data) -> None:
+def test_one_fit_in_time_is_that_of_recon(in_time: TrialData) -> None:
     views = TimedViews(in_time.projections, in_time.geometry, in_time.shown[:VIEWS])
     expected = short_series(views, 2, motion=False)
     np.testing.assert_array_equal(SeriesFit(2, "none").fit(in_time, 0)(3.0), expected.at(3.0))
 
 
-def test_one_fit_of_energies_is_that_of_recon(of_energies: Data) -> None:
+def test_one_fit_of_energies_is_that_of_recon(of_energies: TrialData) -> None:
     energy = of_energies.shown[:VIEWS].astype(np.intp)
     made = fit_materials(EnergyViews(of_energies.projections, of_energies.geometry, energy, SECTIONS))
     at = MaterialsFit().fit(of_energies, 0)(1.0)
     np.testing.assert_allclose(at, SECTIONS[1, 0] * made.densities[0] + SECTIONS[1, 1] * made.densities[1], rtol=1e-5)
 
 
-def test_rays_that_were_not_measured_do_not_count(in_time: Data) -> None:
+def test_rays_that_were_not_measured_do_not_count(in_time: TrialData) -> None:
     weights = np.ones((VIEWS + HELD_OUT, ROWS, SIDE), np.float32)
     weights[:, :, :3] = 0
     figures = []
@@ -122,11 +122,11 @@ def test_rays_that_were_not_measured_do_not_count(in_time: Data) -> None:
         assert in_time.held_out is not None
         held = np.where(weights[VIEWS:] > 0, in_time.held_out[0], np.float32(filled))
         given = replace(in_time, projections=used, weights=weights, held_out=(held, in_time.held_out[1]))
-        figures.append(run(SERIES, given, 0, print)["left"])
+        figures.append(run(SERIES, given, 0, print)["squared_residuals"])
     np.testing.assert_array_equal(*figures)
 
 
-def test_each_view_held_out_is_compared_with_the_volume_of_its_time(in_time: Data) -> None:
+def test_each_view_held_out_is_compared_with_the_volume_of_its_time(in_time: TrialData) -> None:
     """The truth leaves nothing of them; the volume of one moment does."""
     assert in_time.held_out is not None
     unseen, geometry = in_time.held_out
@@ -140,14 +140,14 @@ def test_each_view_held_out_is_compared_with_the_volume_of_its_time(in_time: Dat
     assert np.abs(views(lambda time: truth(5.0)) - unseen).max() > 1
 
 
-def test_what_changes_is_explained_better_by_one_fit_than_by_parts_or_one_volume(in_time: Data) -> None:
+def test_what_changes_is_explained_better_by_one_fit_than_by_parts_or_one_volume(in_time: TrialData) -> None:
     one_volume = Trial("method", "fista-tv", VIEWS)
     trials = one_volume, replace(one_volume, group="parts", parts=2), SERIES
     ignoring, parts, joint = (run(trial, in_time, 0, print)["metrics"]["residual_held_out"] for trial in trials)
     assert joint < 0.5 * parts < 0.5 * ignoring
 
 
-def test_a_share_of_states_is_explained_from_few_views(of_energies: Data) -> None:
+def test_a_share_of_states_is_explained_from_few_views(of_energies: TrialData) -> None:
     apart = run(Trial("parts", "fbp", VIEWS, parts=2), of_energies, 0, print)["metrics"]["residual_held_out"]
     for trial in (MATERIALS, replace(MATERIALS, settings={"share": True})):
         found = run(trial, of_energies, 0, print)
@@ -155,17 +155,17 @@ def test_a_share_of_states_is_explained_from_few_views(of_energies: Data) -> Non
         assert found["gaussians"] is None and found["curve"] == [] and found["cpu_seconds"] > 0
 
 
-def test_a_trial_keeps_what_the_middle_view_shows(in_time: Data, tmp_path: Path) -> None:
+def test_a_trial_keeps_what_the_middle_view_shows(in_time: TrialData, tmp_path: Path) -> None:
     run(SERIES, in_time, 0, print, keep=tmp_path / "volume.npy")
     middle = np.sort(in_time.shown[:VIEWS])[VIEWS // 2]
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), SeriesFit(2, "none").fit(in_time, 0)(float(middle)))
 
 
 def test_times_and_energies_come_through_the_file(
-    of_energies: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    of_energies: TrialData, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     of_energies.save(tmp_path / "data")
-    back = Data.load(tmp_path / "data")
+    back = TrialData.load(tmp_path / "data")
     assert back.states == (0, 1) and back.sections is not None
     np.testing.assert_array_equal(back.sections, SECTIONS)
     np.testing.assert_array_equal(back.shown, of_energies.shown)
@@ -173,10 +173,12 @@ def test_times_and_energies_come_through_the_file(
     (tmp_path / "job.json").write_text(json.dumps(job))
     assert main(tmp_path / "job.json") == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert said["left"] == pytest.approx(run(MATERIALS, of_energies, 0, print)["left"])
+    assert said["squared_residuals"] == pytest.approx(run(MATERIALS, of_energies, 0, print)["squared_residuals"])
 
 
-def test_too_few_views_are_a_failed_trial(in_time: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_few_views_are_a_failed_trial(
+    in_time: TrialData, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     in_time.save(tmp_path / "data")
     trial = replace(SERIES, settings={"volumes": 9, "motion": "none"})
     (tmp_path / "job.json").write_text(json.dumps({"data": str(tmp_path / "data"), "trial": trial.as_job(), "seed": 0}))
@@ -186,7 +188,7 @@ def test_too_few_views_are_a_failed_trial(in_time: Data, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize("how", ["none", "learnt", "chosen"])
 def test_compiling_takes_a_toy_of_the_same_trial(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    toys: list[Data] = []
+    toys: list[TrialData] = []
     monkeypatch.setattr(SeriesFit, "fit", lambda self, data, seed, **given: toys.append(data))
     cone = Geometry.cone(np.linspace(0, 6, 9), (30, 40), 1.0, 60.0, 120.0)
     ready(replace(SERIES, settings={"volumes": 5, "motion": how}), cone)

@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.trials import launch as trial_run
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.launch import compile_kernels, run_trial
 from beamline.trials.plans import plan
 from beamline.trials.trial import Trial
@@ -72,7 +72,7 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
     views = Geometry.parallel(SCAN.angles, SCAN.shape)
-    data = Data(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
+    data = TrialData(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
     data.save(tmp_path / "data")
     ballast = np.ones(90_000_000)  # 720 MB
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)

@@ -28,7 +28,7 @@ def _judged(*trials: tuple[float, list[float]]) -> TrialTable:
     """Trials of so many seconds that leave so much of each view held out; the views have a norm of 10."""
     outcomes = [
         Outcome(Trial("method", "fbp", 10 + n), "done", seconds, metrics={"residual_held_out": sum(left) ** 0.5 / 10},
-                left=left)
+                squared_residuals=left)
         for n, (seconds, left) in enumerate(trials)
     ]  # fmt: skip
     return TrialTable(tuple(outcomes), "residual_held_out", "mm", machine(), {}, "")

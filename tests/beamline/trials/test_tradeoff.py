@@ -11,10 +11,10 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
-from beamline.trials.data import Data
+from beamline.trials.data import TrialData
 from beamline.trials.runner import ComparedScan
 from beamline.trials.table import TrialTable
-from beamline.trials.tradeoff import Several, TradeoffOptions, planned_tradeoff
+from beamline.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff
 from recon.base.geometry import Geometry
 from simulators.light.palette import known
 from tests.beamline.cli.test_materials import ENERGIES, scans, spectra  # noqa: F401 - scans is a fixture
@@ -27,7 +27,7 @@ def asked(path: Path, axis_col: float) -> ComparedScan:
     return ComparedScan(SourceOptions(path), Selection(axis_col=axis_col), path.parent / "out")
 
 
-def planned(scan: ComparedScan, several: Several, warn: Callable[[str], None]) -> tuple[Data, TrialTable]:
+def planned(scan: ComparedScan, several: SeveralVolumes, warn: Callable[[str], None]) -> tuple[TrialData, TrialTable]:
     data, planned = planned_tradeoff(TradeoffOptions(scan, ("fbp",), several), warn)
     return data, planned.table
 
@@ -35,7 +35,7 @@ def planned(scan: ComparedScan, several: Several, warn: Callable[[str], None]) -
 def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     """The file states no times: views follow each other evenly, which a warning says."""
     path, said = write_exchange(tmp_path / "scan.h5", SCAN), list[str]()
-    data, table = planned(asked(path, SCAN.axis_col), Several(volumes=2), said.append)
+    data, table = planned(asked(path, SCAN.axis_col), SeveralVolumes(volumes=2), said.append)
     assert data.held_out is not None and data.truth is None
     angles = np.concatenate((data.geometry.angles, data.held_out[1].angles))
     np.testing.assert_allclose(np.degrees(angles) / 6, data.shown)  # a view each 6 degrees and second
@@ -48,7 +48,7 @@ def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
 def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
     pytest.importorskip("xraylib")
     first, *others = (asked(path, 31.5) for path in scans)
-    several = Several(
+    several = SeveralVolumes(
         others=[(one.source, one.selection) for one in others], spectra=spectra(tmp_path), states=("fresh", "charged")
     )
     data, table = planned(first, several, lambda said: None)
@@ -67,10 +67,10 @@ def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path
 def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     with pytest.raises(Exception, match="never overwritten"):
-        planned(asked(tmp_path / "none.h5", 1.0), Several(spectra=tmp_path / "none.csv"), print)
+        planned(asked(tmp_path / "none.h5", 1.0), SeveralVolumes(spectra=tmp_path / "none.csv"), print)
 
 
 def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
-    several = Several(spectra=spectra(tmp_path), states=("fresh", "full"))
+    several = SeveralVolumes(spectra=spectra(tmp_path), states=("fresh", "full"))
     with pytest.raises(ConfigError, match="expected two of the materials fresh, charged"):
         planned(asked(scans[0], 31.5), several, print)

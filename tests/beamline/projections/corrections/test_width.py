@@ -9,19 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-import recon
 from beamline.core.errors import ConfigError
-from beamline.core.sinks import Warnings
 from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepDone, options_of
-from beamline.reconstruct.live_fit import ScanFollower
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.followed_views import FollowedViews
 from beamline.simulate.scene_file import Scan, open_scene
 from beamline.simulate.write import write_scan
-from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
 from simulators.devices.clock import VirtualClock
 from tests.beamline.array_source import ArraySource
@@ -158,14 +154,12 @@ def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: lis
     assert (done.said != "") == bool(effects)
 
 
-def test_a_followed_scan_sees_the_middle_of_the_exposure_too(tmp_path: Path) -> None:
+def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:
     """Else its volume is turned by half of the arc from that of the finished scan, and its finish knows no motion."""
-    source, clock = _source(), VirtualClock()
-    options = ReconOptions(SourceOptions("scan.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(), recon.R2())
-    follower = ScanFollower(options, source, lambda event: None, clock, Warnings(lambda event: None, clock))
-    ids = np.arange(2, 40)
+    source, ids = _source(), np.arange(2, 40)
+    views = FollowedViews(source, Selection())
     turned = ARC / 2 + SKEW * (SHAPE[0] - 1) / 2
-    np.testing.assert_allclose(follower._angles(ids, 100.0), source.angles[ids] + turned)
-    geometry, done = follower._seen(100.0, ids)
+    np.testing.assert_allclose(views.angles(100.0, ids), source.angles[ids] + turned)
+    geometry, done = views.geometry(100.0, ids)
     assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
     assert done["width"].parameters["exposure_arc_deg"] == pytest.approx(1.6)
