@@ -109,7 +109,7 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
             seconds = _of_direct(method, extent, now)
         return RunTime(seconds, seconds)
     first = Extent(extent.geometry, [min(32, max(extent.heights))])
-    parts = [run_seconds(_candidate(one), first, now) for one in candidates]
+    parts = [run_seconds(_candidate(candidate), first, now) for candidate in candidates]
     parts.append(run_seconds(_candidate(candidates[-1]), extent, now))
     return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
 

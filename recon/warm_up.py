@@ -66,8 +66,8 @@ def warm_up(
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
     with counted(on_kernel or (lambda n: None)):
-        for one in (method, PnpDct()) if isinstance(method, FitMethod) else (method,):  # a fit may end with patches
-            reconstruct(data, views, one.toy(), device=device if one is method else "cpu", use=DataUse(weights))
+        for warmed in (method, PnpDct()) if isinstance(method, FitMethod) else (method,):  # a fit may end with patches
+            reconstruct(data, views, warmed.toy(), device=device if warmed is method else "cpu", use=DataUse(weights))
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
 

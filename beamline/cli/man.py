@@ -27,9 +27,9 @@ def man(ctx: click.Context, command: str | None) -> None:
     page = root.command if command is None else root.command.get_command(root, command)
     if page is None:
         raise click.UsageError(f"There is no command {command}; `beamline --help` lists them.")
-    own = root if command is None else click.Context(page, info_name=command, parent=root)
+    described = root if command is None else click.Context(page, info_name=command, parent=root)
     codes = dedent((root.command.epilog or "").partition("Exit codes:\n")[2])
-    click.echo("\n".join(_page(own, codes)))
+    click.echo("\n".join(_page(described, codes)))
 
 
 def _page(ctx: click.Context, codes: str) -> Iterator[str]:

@@ -127,10 +127,8 @@ def summary(result: Segmented, options: SegmentOptions) -> str:
         f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
     ]
     if result.outside:
-        one = result.outside == 1
-        bodies = (
-            f"{'1 body' if one else f'{result.outside} bodies'} as bright outside the square {'is' if one else 'are'}"
-        )
+        bodies, verb = ("1 body", "is") if result.outside == 1 else (f"{result.outside} bodies", "are")
+        bodies = f"{bodies} as bright outside the square {verb}"
         lines.append(f"{'left out':<12}{bodies} no particle here; --crop none takes the whole volume, with its wall")
     if "d50" in figures:
         sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))

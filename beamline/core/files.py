@@ -84,14 +84,14 @@ def leads_away(path: Path) -> bool:
     return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
 
 
-def same_file(one: os.stat_result, other: os.stat_result) -> bool:
+def same_file(first: os.stat_result, second: os.stat_result) -> bool:
     """Whether two looks were at the same file or folder.
 
     Some file systems of a network number a file anew at each look. Then device, owner, mode, size and the times of the
     last changes tell, the latter of which no program sets.
     """
     fields = "st_dev", "st_uid", "st_mode", "st_size", "st_mtime_ns", "st_ctime_ns"
-    return os.path.samestat(one, other) or all(getattr(one, name) == getattr(other, name) for name in fields)
+    return os.path.samestat(first, second) or all(getattr(first, name) == getattr(second, name) for name in fields)
 
 
 def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:

@@ -60,8 +60,8 @@ def sentence(event: Event) -> str | None:
         case ScanDone(scan):
             alarms = f", {scan.alarmed_frames} WITH AN ALARM" if scan.alarmed_frames else ""
             again = f", {scan.retaken} views taken again" if scan.retaken else ""
-            told = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
-            return f"{told}, {scan.seconds:.1f} s: {scan.path}"
+            head = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
+            return f"{head}, {scan.seconds:.1f} s: {scan.path}"
         case ReconDone(values):
             return f"Volume: {values.get('output', '')}"
         case Failed(message):

@@ -79,7 +79,7 @@ class LightOverScan:
         first = mean if self.views < LASTS else self.first
         return LightOverScan(self.views + 1, first, recent, least, most, (self.rows[0] if self.views else row, row))
 
-    def said(self, limit: float, integrals: bool) -> str:
+    def in_words(self, limit: float, integrals: bool) -> str:
         """The drift over the scan in words, of light or of `integrals`; "" where it is within the limit, a fraction of
         the light.
         """

@@ -64,7 +64,7 @@ class Monitor:
     def drift(self) -> str:
         """What became of the beam's light over the scan, in words; "" where it stayed within the limit of `beam`."""
         limits = [check.drift for check in self.checks if isinstance(check, BeamCheck)]
-        return self.light.said(limits[0], self.context.integrals) if limits else ""
+        return self.light.in_words(limits[0], self.context.integrals) if limits else ""
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:

@@ -134,11 +134,11 @@ def planned_batch(options: BatchOptions) -> BatchPlan:
     Raises:
         DataError: as `run_batch`, which would refuse the folder.
     """
-    folder, known = options.folder, list[BatchRow]()
+    folder, earlier = options.folder, list[BatchRow]()
     if folder.exists():
         _refuse_other(folder, b"" if options.recipe is None else options.recipe.read_bytes())
-        known = _read(folder)
-    rows = _rows(options.scans, known)
+        earlier = _read(folder)
+    rows = _rows(options.scans, earlier)
     bytes_of = {row.name: path.stat().st_size for row in rows if (path := Path(row.scan)).is_file()}
     waiting = {row.name: bytes_of[row.name] for row in rows if not row.has_volume and row.name in bytes_of}
     done = [row for row in rows if row.has_volume and row.seconds and bytes_of.get(row.name)]

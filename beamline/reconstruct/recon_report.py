@@ -34,9 +34,9 @@ def compose(
     metrics: Mapping[str, Mapping[str, float]],
     parameters: Mapping[str, Value],
     context: ReportContext,
-    left: Unexplained | None = None,
+    unexplained: Unexplained | None = None,
 ) -> Report:
-    """The report on a reconstruction; `left` is the structure in its residual, if known."""
+    """The report on a reconstruction; `unexplained` is the structure in its residual, if known."""
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
     }
@@ -52,13 +52,13 @@ def compose(
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
-            *_pictures(made, prepared, truth, volumes, left, context.psnr),
+            *_pictures(made, prepared, truth, volumes, unexplained, context.psnr),
             *_stray_mass(context.stray, made.volume.grid, prepared),
             *_frame_pictures(context.facts),
         ],
         command=context.command,
         recipe=context.recipe,
-        footnotes=_footnotes(made, truth, metrics, left),
+        footnotes=_footnotes(made, truth, metrics, unexplained),
         live_picture=context.live_picture,
     )
 
@@ -91,7 +91,10 @@ def _summary(
 
 
 def _footnotes(
-    made: Reconstruction, truth: Volume | None, metrics: Mapping[str, Mapping[str, float]], left: Unexplained | None
+    made: Reconstruction,
+    truth: Volume | None,
+    metrics: Mapping[str, Mapping[str, float]],
+    unexplained: Unexplained | None,
 ) -> list[str]:
     """What the figures of merit mean, as far as there are any."""
     footnotes = [
@@ -119,11 +122,12 @@ def _footnotes(
         footnotes.append(
             f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before."
         )
-    if left is not None:
+    if unexplained is not None:
         footnotes.append(
-            f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "
-            f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something. It compares "
-            "fits of the same views: views that are displaced have more noise, so less exceeds it."
+            "Matter that leaves structure: voxels at which the back-projected residual of "
+            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above {LIMIT:g} a "
+            "fit hides something. It compares fits of the same views: views that are displaced have more noise, so "
+            "less exceeds it."
         )
     if "stray" in metrics[made.method]:
         footnotes.append(
@@ -170,7 +174,7 @@ def _pictures(
     prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
-    left: Unexplained | None,
+    unexplained: Unexplained | None,
     psnr: Sequence[tuple[float, float]],
 ) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
@@ -216,15 +220,15 @@ def _pictures(
                 figures.error_bars(made.volume, made.deviation, unit, kind),
             )
         )
-    if left is not None:
-        at = len(left.significance) // 2
+    if unexplained is not None:
+        at = len(unexplained.significance) // 2
         pictures.append(
             Picture(
                 "What the volume leaves in the views",
                 "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
                 "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
                 "much, red: too little.",
-                figures.significance(left.significance[at], made.volume.grid, left.first + at, unit),
+                figures.significance(unexplained.significance[at], made.volume.grid, unexplained.first + at, unit),
             )
         )
     if made.history:

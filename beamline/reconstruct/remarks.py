@@ -53,29 +53,29 @@ def lost_mass_warning(made: Reconstruction, beside_fbp: Comparison) -> str:
     )
 
 
-def not_begun_warning(made: Reconstruction, left: float, uniform: float) -> str:
+def not_begun_warning(made: Reconstruction, residual: float, uniform: float) -> str:
     """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a cylinder.
 
     Args:
-        left: residual of the volume. uniform: that of a cylinder of one density, see `measure.uniform_residual`.
+        residual: of the volume. uniform: that of a cylinder of one density, see `measure.uniform_residual`.
     """
-    if left < uniform or by_name(made.method).traits.direct:
+    if residual < uniform or by_name(made.method).traits.direct:
         return ""
     last = made.history[-1] if made.history else None
     steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
     return (
-        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {left:.3g} of the views, where a "
-        f"cylinder of one density that fills the field leaves {uniform:.3g}. The method ended in {made.seconds:.3g} "
+        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {residual:.3g} of the views, where "
+        f"a cylinder of one density that fills the field leaves {uniform:.3g}. The method ended in {made.seconds:.3g} "
         f"s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method fbp."
     )
 
 
-def hiding_warning(made: Reconstruction, left: unexplained.Unexplained) -> str:
+def hiding_warning(made: Reconstruction, structure: unexplained.Unexplained) -> str:
     """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
-    if left.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
+    if structure.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
         return ""
     return (
-        f"{left.share:.1%} of the matter leaves structure in the residual of the views (at most "
+        f"{structure.share:.1%} of the matter leaves structure in the residual of the views (at most "
         f"{unexplained.LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
         "at 'What the volume leaves in the views' in the report, and compare with --method fbp and fista-tv."
     )
@@ -93,12 +93,12 @@ def _crossing_said(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int6
     )
 
 
-def stray_mass_warning(made: Reconstruction, found: stray_mass.StrayMass) -> str:
+def stray_mass_warning(made: Reconstruction, stray: stray_mass.StrayMass) -> str:
     """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
-    if found.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
+    if stray.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
         return ""
     return (
-        f"{found.share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
+        f"{stray.share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
         f"(at most {stray_mass.LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
     )
 

@@ -61,13 +61,13 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
     views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
-    found = (
+    need = (
         f"the live volume is of {count(views, 'view')} of {rows} x {cols} pixels, in about {size(plan.bytes)} of memory"
     )
     if plan.whole:
-        return f"{found}; it may take {most}"
+        return f"{need}; it may take {most}"
     how = [f"one view of {plan.every}"] if plan.every > 1 else []
     how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
     whole = f"all {n_views} of {shape[0]} x {shape[1]} would take {size(live_bytes(shape, n_views))}"
     wide = f"at most {_WIDEST} columns, and " if shape[1] > _WIDEST else ""
-    return f"{found}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
+    return f"{need}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"

@@ -96,7 +96,7 @@ class TableLayout(Protocol):
         """By file name; those that have data."""
 
 
-def said(outcome: Outcome) -> str:
+def status_text(outcome: Outcome) -> str:
     """What stands in place of figures."""
     return f"{'left out' if outcome.trial.left_out else outcome.status}: {outcome.message}".rstrip(": ")
 
@@ -122,7 +122,7 @@ def text(table: TrialTable, layout: TableLayout) -> str:
         done = outcome.status == "done"
         cells = [column.shown(outcome) if done else "" for column in columns]
         line = row("*" if n in marked else " ", labels[n], cells).rstrip()
-        lines.append(line if done else f"{line}  {said(outcome)}")
+        lines.append(line if done else f"{line}  {status_text(outcome)}")
     notes = [*layout.legend(table), *layout.sentences(table)]
     notes += [f"{o.trial.label}: {o.message}." for o in table.compared if o.message]
     return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
@@ -182,7 +182,7 @@ def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture])
                 "labels": layout.labels(outcome),
                 "marked": n in marked,
                 "cells": [column.shown(outcome) for column in columns] if outcome.status == "done" else [],
-                "reason": said(outcome),
+                "reason": status_text(outcome),
             }
             for n, outcome in enumerate(table.outcomes)
         ],

@@ -228,7 +228,7 @@ class Timed:
 
 
 def seconds_left(
-    done: Sequence[Timed], left: Sequence[Trial], cost: Callable[[Trial], float | None] = lambda trial: None
+    done: Sequence[Timed], trials: Sequence[Trial], cost: Callable[[Trial], float | None] = lambda trial: None
 ) -> float | None:
     """How long the trials that are left will take, from those done; None before the first.
 
@@ -241,24 +241,24 @@ def seconds_left(
     """
     if not done:
         return None
-    fixed = sum(timed.wall - timed.working for timed in done) / len(done)
-    typical = sum(timed.working for timed in done) / len(done)
+    fixed = sum(each.wall - each.working for each in done) / len(done)
+    typical = sum(each.working for each in done) / len(done)
     costs = [
-        (timed.working, amount_expected)
-        for timed in done
-        if timed.working > 0
-        and (amount_expected := cost(timed.trial)) is not None
-        and not timed.trial.build().traits.direct
+        (each.working, amount_expected)
+        for each in done
+        if each.working > 0
+        and (amount_expected := cost(each.trial)) is not None
+        and not each.trial.build().traits.direct
     ]  # a direct method is over too soon to tell how fast this machine is
     whole, total = sum(amount_expected for _, amount_expected in costs), 0.0
-    for trial in left:
+    for trial in trials:
         if trial.seconds_asked is not None:
             total += fixed + trial.seconds_asked
             continue
-        same = [timed for timed in done if timed.trial.method == trial.method and timed.working > 0]
-        amount = sum(work(timed.trial) for timed in same)
+        same = [each for each in done if each.trial.method == trial.method and each.working > 0]
+        amount = sum(work(each.trial) for each in same)
         if amount > 0:
-            seconds = work(trial) * sum(timed.working for timed in same) / amount
+            seconds = work(trial) * sum(each.working for each in same) / amount
         elif whole > 0 and (unseen := cost(trial)) is not None:
             seconds = unseen * sum(working for working, _ in costs) / whole
         else:

@@ -246,8 +246,8 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
         return
     finite = np.abs(views, dtype=np.float64) <= LARGEST
     if not finite.any():
-        said = f"No finite pixel in the projections looked at: they are all NaN, infinite or beyond {LARGEST:g}."
-        yield Finding("error", "pixels", said)
+        message = f"No finite pixel in the projections looked at: they are all NaN, infinite or beyond {LARGEST:g}."
+        yield Finding("error", "pixels", message)
     elif float(views[finite].min()) == float(views[finite].max()):
         yield Finding("error", "pixels", f"Every pixel of the projections looked at is {views[finite][0]:g}.")
     elif not finite.all():
