@@ -32,14 +32,22 @@ class Repeatable(click.Command):
 
 
 def given(ctx: click.Context) -> dict[click.Option, Any]:
-    """The options that the user gave, on the command line or in a recipe, as they were typed there."""
+    """The options that the user gave, on the command line or in a recipe, as they were typed there.
+
+    A flag that a recipe switches off (`uncertainty: false`) is as if it had not been given.
+    """
     typed = {}
     for param in ctx.command.params:
-        source = ctx.get_parameter_source(param.name or "")
-        if isinstance(param, click.Option) and source == ParameterSource.COMMANDLINE:
-            typed[param] = ctx.meta[_RAW][param.name]
-        elif isinstance(param, click.Option) and source == ParameterSource.DEFAULT_MAP:
-            typed[param] = (ctx.default_map or {})[param.name]
+        name = str(param.name)
+        source = ctx.get_parameter_source(name)
+        if not isinstance(param, click.Option) or (
+            param.is_flag and not param.secondary_opts and not ctx.params.get(name)
+        ):
+            continue
+        if source == ParameterSource.COMMANDLINE:
+            typed[param] = ctx.meta[_RAW][name]
+        elif source == ParameterSource.DEFAULT_MAP:
+            typed[param] = (ctx.default_map or {})[name]
     return typed
 
 
@@ -85,7 +93,7 @@ def repeating(ctx: click.Context, argument: Path | Sequence[Path], output: Path,
             continue
         if option.is_flag:
             on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")
-            words += [max(option.opts if on else option.secondary_opts, key=len)] if on or option.secondary_opts else []
+            words.append(max(option.opts if on else option.secondary_opts, key=len))
             continue
         name, several = max(option.opts, key=len), value if isinstance(value, list | tuple) else [value]
         values = [_from_anywhere(str(each), option.type) for each in several]

@@ -80,7 +80,7 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
         what, suffix = ("only --axis try", ".h5") if axes is None else ("--axis try", SHEET)
         example = path.with_suffix(suffix)
         raise click.UsageError(f"-o {output}: {what} writes a picture; give a name such as {example}.")
-    if not values["follow"] and values["write_config"] is None:
+    if not values["follow"] and values["write_config"] is None and values["log"] is None:  # a log holds the failure
         require_there(file, values["as_json"])
     options = _options(context, file, method, path, values | {"axis": None if axes is not None else values["axis"]})
     if values["write_config"] is not None:

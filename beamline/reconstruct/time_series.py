@@ -36,7 +36,6 @@ from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.run_time import RunTime
 from recon.series import TimedViews, fit_series
 from recon.series_time import series_seconds
 
@@ -66,7 +65,7 @@ class SeriesNeeds:
         shape: [time, z, y, x].
         memory, allowed: bytes in memory, and those that may be used.
         output: bytes on the disk.
-        time: that it takes, without reading and correction; None: not estimated.
+        seconds, least_seconds: that it takes, without reading and correction; None: not estimated.
     """
 
     shape: tuple[int, int, int, int]
@@ -74,7 +73,8 @@ class SeriesNeeds:
     memory: int
     allowed: int
     output: int
-    time: RunTime | None = None
+    seconds: float | None = None
+    least_seconds: float | None = None
 
     @classmethod
     def of(cls, options: ReconOptions, request: SeriesRequest, geometry: Geometry) -> SeriesNeeds:
@@ -102,9 +102,9 @@ class SeriesNeeds:
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}",
             f"{'disk':<10}{size(self.output)} for the result",
         ]
-        if self.time is None:
+        if self.seconds is None or self.least_seconds is None:
             return lines
-        least, most = (duration_text(seconds) for seconds in (self.time.least, self.time.most))
+        least, most = (duration_text(seconds) for seconds in (self.least_seconds, self.seconds))
         return [*lines, f"{'time':<10}about {least} to {most}, reading and correction not counted"]
 
 
@@ -115,9 +115,10 @@ def series_needs(options: ReconOptions, request: SeriesRequest, clock: Clock) ->
     needs = SeriesNeeds.of(options, request, geometry)
     needs.refuse()
     try:
-        return replace(needs, time=series_seconds(geometry, request.volumes, request.moves, _SWEEPS, clock.now))
+        most, least = series_seconds(geometry, request.volumes, request.moves, _SWEEPS, clock.now)
     except ValueError as error:
         raise ConfigError(f"--time {request.volumes}: {error}. Nothing was written.") from error
+    return replace(needs, seconds=most, least_seconds=least)
 
 
 @dataclass(frozen=True, eq=False)

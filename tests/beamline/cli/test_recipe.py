@@ -175,6 +175,12 @@ def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> No
     assert not np.array_equal(first.volume.data, rectified.volume.data)
 
 
+def test_a_flag_that_a_recipe_switches_off_excludes_nothing_and_chooses_no_method(folder: Path) -> None:
+    Path("recipe.yaml").write_text("uncertainty: false\nearly-stop: no\n")
+    result = beamline("recon", "scan.h5", "--config", "recipe.yaml", "--budget", "30s", "--write-config", "-")
+    assert (result.exit_code, result.stdout) == (0, "method: auto\nbudget: 30s\n"), result.output
+
+
 def test_with_an_output_the_recipe_is_written_and_the_volume_made(folder: Path) -> None:
     assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "both.yaml", "-o", "both.h5").exit_code == 0
     assert (folder / "both.yaml").read_text() == read_reconstruction(folder / "both.h5").parameters["recipe"]

@@ -175,6 +175,8 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     assert "2 of 2 x 40 x 40 voxels, from 36 views" in done.output
     assert "memory" in done.output
     assert " s to " in done.output.splitlines()[-1]
+    told = json.loads(beamline("recon", str(scan), "--time", "2", "--dry-run", "--json").stdout)
+    assert (told["seconds"], told["least_seconds"]) == (70.0, 30.0) and told["time"] > 1e9  # of the event
     assert not left(tmp_path)
 
 
