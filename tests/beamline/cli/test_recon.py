@@ -59,7 +59,7 @@ def test_a_report_that_fails_takes_the_folder_of_slices_with_it(folder: Path, mo
     def full(*_: object, **__: object) -> None:
         raise DataError("v.html could not be written (No space left on device).")
 
-    monkeypatch.setattr("beamline.reconstruct.result.write_report", full)
+    monkeypatch.setattr("beamline.report.html.write_report", full)
     assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "v").exit_code == 5
     assert left(folder) == {"scan.h5"}
 

@@ -17,7 +17,6 @@ from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import checkpoints, offline
-from beamline.reconstruct import result as deliver
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
@@ -232,7 +231,7 @@ def test_a_report_that_fails_takes_the_volume_with_it(tmp_path: Path, monkeypatc
     def full(*_: object, **__: object) -> None:
         raise DataError("no space left")
 
-    monkeypatch.setattr(deliver, "write_report", full)
+    monkeypatch.setattr("beamline.report.html.write_report", full)
     options = _options(tmp_path, target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"))
     with pytest.raises(DataError, match="no space"):
         reconstruct_file(options, lambda e: None, SystemClock())
