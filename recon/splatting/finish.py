@@ -28,7 +28,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, choose_weight, is_coarse, simplest
 from recon.voxels.iterative import prior_decisions, solve
-from recon.voxels.methods.pnp_dct import TRIAL_STEPS, PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import TRIAL_STEPS, TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.pnp_dct import pnp_dct
@@ -87,7 +87,7 @@ class _Planning:
     apart: bool = False
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        judge = HeldOutTrial.of(problem)
+        judge = HeldOutTrial.of(problem, air=True)
         if judge is None:
             return x
         weight = choose_weight(problem, x, modelled=False, trial=lambda: judge)
@@ -122,7 +122,7 @@ class _Planning:
         )
         self.apart = beyond is not None and not is_coarse(seen.geometry, seen.grid)
         refined = trial.made(
-            lambda some, x: refine(_without(some, beyond), x, weight, strength, SWEEPS, TRIAL_STEPS),
+            lambda some, x: refine(_without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, SWEEPS, TRIAL_STEPS),
             volume_lines(np.maximum(fitted.volume.data, 0)),
         )
         return trial.residuals(refined, other)

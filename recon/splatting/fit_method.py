@@ -48,8 +48,8 @@ class FitMethod(Method, Protocol):
     def by_content(self) -> bool:
         """Views held out tell whether the fit pays, see `finish.best_candidate`."""
 
-    def for_trial(self, share: float, count: int | None) -> Self:
-        """The fit alone, of this share of the rows; `count`: Gaussians of all rows, None: as many as set."""
+    def for_trial(self, share: float) -> Self:
+        """The fit alone, of this share of the rows."""
 
     @property
     def least_steps(self) -> int | None:

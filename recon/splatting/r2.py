@@ -104,9 +104,9 @@ class R2:
         """The fit that competes with methods on voxels: it is made, whatever they predict."""
         return replace(self, steps=self.planned_steps) if self.by_content else self
 
-    def for_trial(self, share: float, count: int | None) -> Self:
-        fit = self.as_candidate()
-        return replace((fit if count is None else replace(fit, gaussians=count)).for_part(share, 1.0), finish=0)
+    def for_trial(self, share: float) -> Self:
+        """The fit alone, of this share of the rows."""
+        return replace(self.as_candidate().for_part(share, 1.0), finish=0)
 
     @property
     def finish_sweeps(self) -> int:

@@ -290,9 +290,8 @@ def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: De
     """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
 
     def short(part: ReconProblem, watched: RunControl) -> Reconstruction:
-        rows, cols = np.divide(part.geometry.detector_shape, views.told.detector_shape)
-        count = views.count if cols < 1 else None  # without the air it would take as many for less of the field
-        return run_fit(method.for_trial(float(rows), count), part, watched)
+        share = part.geometry.detector_shape[0] / views.told.detector_shape[0]
+        return run_fit(method.for_trial(share), part, watched)
 
     at, prior = best_candidate(views.fitted, method.fit, control, short)
     decide.preset(prior)

@@ -245,8 +245,10 @@ class HeldOutTrial:
         self._known: dict[tuple[str, float], F64] = {}
 
     @classmethod
-    def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
-        """The trial of the rows with most matter, without air far beside it; of a cone of those in the middle.
+    def of(cls, problem: VoxelProblem, air: bool = False) -> HeldOutTrial | None:
+        """The trial of the rows with most matter; of a cone of those in the middle.
+
+        Columns of air far beside the sample are left out, unless `air`: a fit of narrower views is a poorer one.
 
         None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
         `problem.trial_goes_on` ends it.
@@ -258,7 +260,8 @@ class HeldOutTrial:
         if not geometry.is_cone:
             rows = busiest_rows(images, TRIAL_ROWS)
             views, box = slab_of(geometry, grid, rows.start, rows.stop)
-            cols, views, box = columns_of_matter(views, box, images[:, rows]) or (slice(None), views, box)
+            narrow = None if air else columns_of_matter(views, box, images[:, rows])
+            cols, views, box = narrow or (slice(None), views, box)
             return cls._of_rows(problem, rows, views, box, cols)
         if geometry.detector_shape[0] <= TRIAL_ROWS:
             return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)

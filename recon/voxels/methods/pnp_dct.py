@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
+from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
@@ -22,16 +24,18 @@ from recon.voxels.held_out import (
     preferred_strength,
     simplest,
 )
-from recon.voxels.iterative import run_iterative
+from recon.voxels.iterative import prior_decisions, run_iterative, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
+from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 
 _FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
 TRIAL_STEPS = 15
 """Steps of a trial of patches, three rounds."""
-_STRONGER = 1.6  # times the threshold, which views held out prefer after so few steps (1.5 to 1.8 on four slabs)
+TRIAL_THRESHOLD = 1.6
+"""Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +154,32 @@ def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
     """What the volume that patches make of this one leaves of the views held out."""
 
     def made(strength: float) -> F32:
-        return trial.made(lambda part, first: pnp_dct(part, first, _STRONGER * strength, steps=TRIAL_STEPS), x)
+        return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
 
     return trial.residuals_of("patches", strength, made)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """The search for a prior as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is."""
+
+    iterations: int = 1
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        trial = cache(partial(HeldOutTrial.of, problem))
+        choose_patches(problem, choose_weight(problem, x, modelled=False, trial=trial), trial)
+        return x
+
+
+def prior_of(problem: ReconProblem, on_trial: Callable[[], bool]) -> dict[str, Sequence[Any]]:
+    """Decisions on both priors by views held out, for any method on voxels; none where nothing can be held out.
+
+    Args:
+        on_trial: called after each sweep of a trial; true ends them, without a decision.
+    """
+    data, known = masked(problem.projections, problem.use.weights)
+    if not data.any():
+        return {}
+    decide, projector = Decisions(problem.seed), Projector(problem.geometry, problem.grid)
+    solve(_Prior(), projector, data, weight=known, on_trial=on_trial, decide=decide)
+    return prior_decisions(decide.made)
