@@ -17,9 +17,11 @@ from recon.base.masks import masked
 from recon.base.method import Method, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
+from recon.splatting.fit_method import FitMethod
 from recon.voxels.direct import direct
 from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -31,7 +33,7 @@ _WINDOW = 7  # voxels, a side: variances are averaged over it; one squared diffe
 _CLASSES = 4  # of the gradient, which are averaged apart: edges move more than what lies beside them
 _EDGE = 0.7  # voxels, the blur before the gradient
 _SAMPLED = 2**20  # voxels that give the limits of the classes
-_OF_RUN = ("units", "weight", "balance")  # decisions of the run that a refit follows
+_OF_RUN = ("units", "weight", "balance", "strength", "threshold")  # decisions of the run that a refit follows
 _LIMITS = "limits"  # the decision of the first slab's error bars that tells them from the run's
 
 
@@ -57,7 +59,7 @@ def error_bars(
     goes on from the volume twice, for fewer iterations: one half weighs 1.5 and the other 0.5, then the reverse.
     Half the difference, divided by 0.5, has the variance of the noise. That is a jackknife of two groups, by weights
     (Shao & Tu 1995, The Jackknife and Bootstrap, 2.3). What both refits have in common cancels: how far the volume is
-    from convergence. A fit is refitted on voxels by FISTA-TV with the weight of its finish. FBP is
+    from convergence. The volume of a fit is refitted by the method on voxels that made it, or that refined it. FBP is
     linear: half the difference of the FBPs of both halves is FBP of the views with alternating signs.
 
     One squared difference is a poor variance. It is averaged over 7³ voxels, in four classes of the gradient apart.
@@ -77,12 +79,15 @@ def error_bars(
     Raises:
         ValueError: a method without calibrated error bars, fewer than eight views, or a fit without a finish.
     """
-    factors, geometry = method.traits.error_bars, problem.geometry
-    if factors is None:
+    geometry = problem.geometry
+    if method.traits.error_bars is None:
         known = ", ".join(with_trait("error_bars"))
         raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(f"error bars need {LEAST_VIEWS} views, in two halves; here are {geometry.n_views}")
+    method = method_on_voxels(method, decided)
+    factors = method.traits.error_bars
+    assert factors is not None
     made: Mapping[str, Sequence[Any]] = {}
     if method.traits.direct:
         difference = _alternating(method, problem)
@@ -102,11 +107,28 @@ def error_bars(
     return ErrorBars(np.sqrt(variance, out=variance), {**made, **decide.made})
 
 
+def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Method:
+    """The method whose refits show the noise: of a fit, the one that made its volume or the last steps of its finish.
+
+    Raises:
+        ValueError: a fit without a finish.
+    """
+    if not isinstance(method, FitMethod):
+        return method
+    if "weight" not in decided:
+        raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
+    smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
+    _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
+    at = decided.get("candidate", [-1])[-1]
+    return {0: smooth, 1: patches}.get(at, patches if by_patches else smooth)
+
+
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Most bytes that `error_bars` takes beside the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
-    work = method.memory if method.traits.direct else _refit(method).memory
-    return work(geometry, grid, True) + 4 * (2 * rays + 5 * voxels)
+    made_by = (FistaTv(), PnpDct()) if isinstance(method, FitMethod) else (method,)
+    work = max(one.memory(geometry, grid, True) for one in made_by)
+    return work + 4 * (2 * rays + 5 * voxels)
 
 
 def alternating(geometry: Geometry) -> F32:
@@ -129,8 +151,6 @@ def _refitted(
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
     refit = _refit(method)
-    if not isinstance(method, IterativeMethod) and "weight" not in decided:
-        raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     data, known = masked(problem.projections, problem.use.weights)
@@ -170,12 +190,10 @@ class _Refit(IterativeMethod, Method, Protocol):
 
 
 def _refit(method: Method) -> _Refit:
-    """The iterative method of the refits: the method itself, or that of a fit's finish."""
-    if isinstance(method, IterativeMethod):
-        n = max(1, round(_SHARE * method.iterations))
-        refit: _Refit = with_settings(method, {"iterations": n})
-        return refit
-    return FistaTv(iterations=max(1, round(_SHARE * FistaTv().iterations)))
+    """The method of the refits, with fewer iterations."""
+    assert isinstance(method, IterativeMethod)
+    refit: _Refit = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
+    return refit
 
 
 def _of_run(decided: Mapping[str, Sequence[Any]], sweeps: int) -> dict[str, list[Any]]:

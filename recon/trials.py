@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -38,25 +38,33 @@ class TrialsVerdict(NamedTuple):
 
 
 def predicts_best(
-    part: ReconProblem, methods: Sequence[Method], control: RunControl, order: Sequence[int] | None = None
+    part: ReconProblem,
+    methods: Sequence[Method],
+    control: RunControl,
+    order: Sequence[int] | None = None,
+    prior: Mapping[str, Sequence[Any]] | None = None,
+    on_voxels: ReconProblem | None = None,
 ) -> TrialsVerdict:
     """Which of the methods predicts unseen views best (one of eight is held out): `held_out.simplest` of them.
 
-    A prior that one trial chooses by views held out is that of the next ones. A method that `control` cuts short is not
-    judged.
+    A prior that one trial chooses by views held out is that of the next ones, unless `prior` is given. A method that
+    `control` cuts short is not judged.
 
     Args:
         methods: the simplest and cheapest first.
         order: in which they are tried; None: the same.
+        prior: decisions on it, which all trials follow.
+        on_voxels: the part for methods that model no matter beyond the grid, without air beside it; None: the same.
 
     Raises:
         ValueError: no method takes these views or data.
     """
     n, begin = part.geometry.n_views, control.now()
-    trial, judge = (of_views(part, views) for views in split_views(part.geometry))
+    seen, unseen = split_views(part.geometry)
+    trial, narrow, judge = of_views(part, seen), of_views(on_voxels or part, seen), of_views(part, unseen)
     residuals: dict[int, F64] = {}
     refused: list[str] = []
-    decided: dict[str, Sequence[Any]] = {}
+    decided = dict(prior or {})
 
     def stopped() -> bool:
         return control.should_stop is not None and control.should_stop()
@@ -69,7 +77,8 @@ def predicts_best(
         tell = _of_trial(control, f"{method.name}, {done} of {len(methods)}")
         run = RunControl(control.should_stop, tell, now=control.now, decide=decide)
         try:
-            volume = method.run(replace(trial, device=device), run).volume
+            given = trial if method.traits.any_grid else narrow
+            volume = method.run(replace(given, device=device), run).volume
         except ValueError as error:
             refused.append(f"{method.name}: {error}")
             continue

@@ -50,6 +50,7 @@ from recon.base.method import (
 )
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
+from recon.error_bars import method_on_voxels
 from recon.methods import with_trait
 from recon.splatting.backend import backend_for
 from recon.splatting.fit_method import FitMethod
@@ -305,8 +306,9 @@ def _with_error_bars(job: _Job, made: Reconstruction, slabs: Sequence[Slab], dec
     if deviation is None:
         job.warn(f"The error bars were left out: {why}. The volume is whole.")
         return made
-    assert method.traits.error_bars is not None
-    settings = dict(zip(("error_bars_spread", "error_bars_gradient"), method.traits.error_bars, strict=True))
+    factors = method_on_voxels(method, decided.made).traits.error_bars
+    assert factors is not None
+    settings = dict(zip(("error_bars_spread", "error_bars_gradient"), factors, strict=True))
     return replace(made, deviation=deviation, settings={**made.settings, **settings})
 
 

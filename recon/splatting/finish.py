@@ -28,7 +28,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, choose_weight, is_coarse, simplest
 from recon.voxels.iterative import prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import TRIAL_STEPS, TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.pnp_dct import pnp_dct
@@ -87,7 +87,7 @@ class _Planning:
     apart: bool = False
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        judge = HeldOutTrial.of(problem)
+        judge = HeldOutTrial.of(problem, air=True)
         if judge is None:
             return x
         weight = choose_weight(problem, x, modelled=False, trial=lambda: judge)
@@ -122,7 +122,7 @@ class _Planning:
         )
         self.apart = beyond is not None and not is_coarse(seen.geometry, seen.grid)
         refined = trial.made(
-            lambda some, x: refine(_without(some, beyond), x, weight, strength, SWEEPS),
+            lambda some, x: refine(_without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, SWEEPS, TRIAL_STEPS),
             volume_lines(np.maximum(fitted.volume.data, 0)),
         )
         return trial.residuals(refined, other)
@@ -152,7 +152,9 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, volume: Volume, setting
     return model - Projector(views, grid).forward(np.maximum(volume.data, 0))
 
 
-def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int) -> F32:
+def refine(
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength: float, sweeps: int, steps: int
+) -> F32:
     """Sweeps of total variation from x [y, x, z], and steps with sparse patches where these have a strength."""
     ended = False
 
@@ -166,7 +168,7 @@ def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength
     if ended or not strength:
         return x
     further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
-    return pnp_dct(further, x, strength, steps=PnpDct().iterations)
+    return pnp_dct(further, x, strength, steps=steps)
 
 
 def best_candidate(
@@ -205,7 +207,7 @@ class _Finish:
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
-        return refine(problem, x, weight, strength, self.iterations)
+        return refine(problem, x, weight, strength, self.iterations, PnpDct().iterations)
 
 
 class Finished(NamedTuple):

@@ -37,6 +37,11 @@ CHOICE_SWEEPS = 4 * _SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
 _ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
+_AIR, _BESIDE, _NARROWER = (
+    0.03,
+    0.05,
+    0.9,
+)  # shares: of the largest line integral; of the matter's width; of the columns
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 
 
@@ -78,6 +83,30 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
         slab = replace(slab, shape=(slices, *slab.shape[1:]), centre=((low + high) / 2, 0.0, 0.0))
     shape, centre = (slab.shape[0], *grid.shape[1:]), (slab.centre[0], *grid.centre[1:])
     return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
+
+
+def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
+    """The columns of `images` [view, row, col] that see matter, with some air beside it, and the box that holds it.
+
+    None: they are nearly all columns, or rows do not show slices around the detector's middle.
+    """
+    if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
+        return None
+    deepest = images.mean(axis=1).max(axis=0)
+    there = np.flatnonzero(deepest > _AIR * deepest.max())
+    axis, width = geometry.axis_col + geometry.shifts[:, 0], geometry.detector_shape[1]
+    if not there.size:
+        return None
+    half = (1 + 2 * _BESIDE) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
+    first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
+    if stop - first > _NARROWER * width:
+        return None
+    views = replace(
+        geometry, detector_shape=(geometry.detector_shape[0], stop - first), axis_col=geometry.axis_col - first
+    )
+    across = 2 * half * geometry.sample_pitch / grid.voxel_size
+    sides = (n - 2 * max(0, math.floor((n - across) / 2)) for n in grid.shape[1:])
+    return slice(first, stop), views, replace(grid, shape=(grid.shape[0], *sides))
 
 
 def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
@@ -218,8 +247,10 @@ class HeldOutTrial:
         self._known: dict[tuple[str, float], F64] = {}
 
     @classmethod
-    def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
+    def of(cls, problem: VoxelProblem, air: bool = False) -> HeldOutTrial | None:
         """The trial of the rows with most matter; of a cone of those in the middle.
+
+        Columns of air far beside the sample are left out, unless `air`: a fit of narrower views is a poorer one.
 
         None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
         `problem.trial_goes_on` ends it.
@@ -230,17 +261,22 @@ class HeldOutTrial:
         images = problem.data.swapaxes(1, 2)
         if not geometry.is_cone:
             rows = busiest_rows(images, TRIAL_ROWS)
-            return cls._of_rows(problem, rows, *slab_of(geometry, grid, rows.start, rows.stop))
+            views, box = slab_of(geometry, grid, rows.start, rows.stop)
+            narrow = None if air else columns_of_matter(views, box, images[:, rows])
+            cols, views, box = narrow or (slice(None), views, box)
+            return cls._of_rows(problem, rows, views, box, cols)
         if geometry.detector_shape[0] <= TRIAL_ROWS:
             return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)
         middle = middle_of_cone(geometry, grid, images, TRIAL_ROWS)
         return None if middle is None else cls._of_rows(problem, *middle)
 
     @classmethod
-    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid) -> HeldOutTrial | None:
+    def _of_rows(
+        cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, cols: slice = slice(None)
+    ) -> HeldOutTrial | None:
         def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
             def cut(rays: F32) -> F32:
-                return np.ascontiguousarray(rays[chosen][:, :, rows])
+                return np.ascontiguousarray(rays[chosen][:, cols, rows])
 
             return replace(
                 problem,

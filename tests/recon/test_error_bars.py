@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.error_bars import alternating, error_bars, error_bars_memory
+from recon.error_bars import alternating, error_bars, error_bars_memory, method_on_voxels
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 
@@ -90,6 +91,29 @@ def test_a_fit_is_refitted_with_the_weight_of_its_finish() -> None:
         made(replace(method, finish=0), problem())
 
 
+@pytest.mark.parametrize(
+    ("decided", "name"),
+    [
+        ({"candidate": [0], "strength": [[0.1, 1]]}, "fista-tv"),
+        ({"candidate": [1], "strength": [[0.1, 1]]}, "pnp-dct"),
+        ({"candidate": [2], "strength": [[0.1, 1]]}, "pnp-dct"),
+        ({"candidate": [2], "strength": [[0.1, 0]]}, "fista-tv"),
+        ({}, "fista-tv"),
+    ],
+)
+def test_the_volume_of_a_fit_is_refitted_by_what_made_or_refined_it(decided: dict[str, Any], name: str) -> None:
+    assert method_on_voxels(recon.R2(), {"weight": [[0.1]], **decided}).name == name
+
+
+def test_patches_go_on_from_the_volume() -> None:
+    """A first volume by total variation would take 20 sweeps more, and would forget this one."""
+    told = list[Progress]()
+    method, decided = recon.PnpDct(iterations=10, patch_threshold=0.1), {"weight": [[1e-3]]}
+    found = error_bars(method, problem(), Volume(ball(), GRID), decided, RunControl(on_progress=told.append))
+    assert found is not None and np.isfinite(found.deviation).all() and found.deviation.max() > 0
+    assert [p.step for p in told] == [1, 2, 3, 4]
+
+
 def test_the_same_seed_gives_the_same_bits_and_another_slab_follows() -> None:
     method, given, decide = recon.FistaTv(iterations=5, tv_weight=1e-3), problem(), Decisions(0)
     volume = method.run(given, RunControl(decide=decide)).volume
@@ -117,7 +141,7 @@ def test_a_stop_leaves_it_out() -> None:
 
 def test_a_method_without_calibration_and_too_few_views_are_refused() -> None:
     given = problem()
-    with pytest.raises(ValueError, match="not calibrated; they are of r2, fbp, fista-tv"):
+    with pytest.raises(ValueError, match="not calibrated; they are of r2, fbp, fista-tv, pnp-dct"):
         error_bars(recon.Sirt(), given, Volume(ball(), GRID), {}, RunControl())
     few = VIEWS.select(np.arange(0, 96, 16))
     less = replace(given, geometry=few, projections=given.projections[::16])

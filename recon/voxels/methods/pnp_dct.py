@@ -3,30 +3,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
+from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out import CHOICE_SWEEPS, HeldOutTrial, alike_of, is_coarse, preferred_strength, simplest
-from recon.voxels.iterative import run_iterative
+from recon.voxels.held_out import (
+    CHOICE_SWEEPS,
+    HeldOutTrial,
+    alike_of,
+    choose_weight,
+    is_coarse,
+    preferred_strength,
+    simplest,
+)
+from recon.voxels.iterative import prior_decisions, run_iterative, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
+from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 
 _FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
+TRIAL_STEPS = 15
+"""Steps of a trial of patches, three rounds."""
+TRIAL_THRESHOLD = 1.6
+"""Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
 
 @dataclass(frozen=True)
 class PnpDct:
     """Steps towards the views, and patches of 4 x 4 x 4 voxels with few cosine coefficients, in turn; see
-    `recon.voxels.pnp_dct`. The first volume is that of FISTA-TV by default. Memory: as `FistaTv`.
+    `recon.voxels.pnp_dct`. The first volume is that of FISTA-TV, unless one is given. Memory: as `FistaTv`.
 
     Attributes:
         iterations: steps towards the views, five between two thresholds.
@@ -36,7 +51,7 @@ class PnpDct:
 
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
-    traits: ClassVar[Traits] = Traits(halo=16, own_length=True)
+    traits: ClassVar[Traits] = Traits(halo=16, own_length=True, error_bars=(2.3, 0.25))
 
     iterations: int = 35
     patch_threshold: float | None = None
@@ -54,13 +69,13 @@ class PnpDct:
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * PnpDct().iterations
+        return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * TRIAL_STEPS
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        ended, sweeps = False, self.first_sweeps
+        ended, sweeps = False, 0 if x.any() else self.first_sweeps
 
         def first(sweep: int, residual: float) -> bool:
             nonlocal ended
@@ -68,7 +83,11 @@ class PnpDct:
             return not ended
 
         trial = cache(partial(HeldOutTrial.of, problem))
-        x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+        weight: NoiseBalance | float
+        if sweeps:
+            x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+        else:
+            weight = choose_weight(problem, x, modelled=False, trial=trial)
         if ended:
             return x
         share = self.patch_threshold
@@ -135,6 +154,32 @@ def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
     """What the volume that patches make of this one leaves of the views held out."""
 
     def made(strength: float) -> F32:
-        return trial.made(lambda part, first: pnp_dct(part, first, strength, steps=PnpDct().iterations), x)
+        return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
 
     return trial.residuals_of("patches", strength, made)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """The search for a prior as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is."""
+
+    iterations: int = 1
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        trial = cache(partial(HeldOutTrial.of, problem))
+        choose_patches(problem, choose_weight(problem, x, modelled=False, trial=trial), trial)
+        return x
+
+
+def prior_of(problem: ReconProblem, on_trial: Callable[[], bool]) -> dict[str, Sequence[Any]]:
+    """Decisions on both priors by views held out, for any method on voxels; none where nothing can be held out.
+
+    Args:
+        on_trial: called after each sweep of a trial; true ends them, without a decision.
+    """
+    data, known = masked(problem.projections, problem.use.weights)
+    if not data.any():
+        return {}
+    decide, projector = Decisions(problem.seed), Projector(problem.geometry, problem.grid)
+    solve(_Prior(), projector, data, weight=known, on_trial=on_trial, decide=decide)
+    return prior_decisions(decide.made)

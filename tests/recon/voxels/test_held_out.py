@@ -26,6 +26,7 @@ from recon.voxels.held_out import (
     HeldOutTrial,
     beyond_chance,
     busiest_rows,
+    columns_of_matter,
     preferred_strength,
     simplest,
     slab_of,
@@ -235,3 +236,25 @@ def test_views_held_out_that_weigh_nothing_in_the_busiest_rows_leave_the_weight_
     weights[split_views(geometry)[1], :ROWS] = 0
     found = recon.reconstruct(data, geometry, FistaTv(iterations=1), grid=grid, use=recon.DataUse(weights=weights))
     assert np.isfinite(found.volume.data).all()
+
+
+def test_trials_see_the_columns_with_matter() -> None:
+    """A disc of a third of the field, off the axis: its voxels lie where those of the whole grid lie."""
+    views = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 120), pixel_pitch=0.5, axis_col=57.3)
+    grid = Grid.matching(views)
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = (np.hypot(x - 4, y) < 10).astype(np.float32)
+    images = Projector(views, grid).forward(disc)
+    cropped = columns_of_matter(views, grid, images)
+    assert cropped is not None
+    cols, narrow, box = cropped
+    kept = [np.isin(whole, part) for whole, part in zip(grid.coordinates(), box.coordinates(), strict=True)]
+    inside = disc[np.ix_(*kept)]
+    assert inside.shape == box.shape and inside.sum() == disc.sum()
+    assert (
+        narrow.detector_shape[1] < 80 and not images[:, :, : cols.start].any() and not images[:, :, cols.stop :].any()
+    )
+    again = Projector(narrow, box).forward(inside)
+    np.testing.assert_allclose(again, images[:, :, cols], atol=1e-4 * images.max())
+    full = np.ones_like(images)
+    assert columns_of_matter(views, grid, full) is None
