@@ -143,8 +143,8 @@ def test_a_trial_gives_what_the_function_gives_of_the_same_counts(pet: Path, tmp
     truth = np.asarray(h5py.File(pet.with_name("truth.h5"))["entry/data/data"][()])
     for given, views in ((truth, 24), (truth, 12), (None, 21)):
         data = split(prepared, given)
-        data.save(tmp_path / "data.npz")
-        loaded = TrialData.load(tmp_path / "data.npz")
+        data.save(tmp_path / f"views{views}")
+        loaded = TrialData.load(tmp_path / f"views{views}")
         trial = Trial("method", "osem", views, settings={"iterations": 2, "subsets": 3}, halves=True)
         found = run(trial, loaded, 0, lambda _: None, keep=tmp_path / "volume.npy")
         ids = (prepared if given is not None else hold_out(prepared, 8, advice="")).projections.view_ids
