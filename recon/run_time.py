@@ -108,8 +108,11 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
         else:
             seconds = _of_direct(method, extent, now)
         return RunTime(seconds, seconds)
-    first = Extent(extent.geometry, [min(32, max(extent.heights))])
-    parts = [run_seconds(_candidate(one), first, now) for one in candidates]
+    first = [min(32, max(extent.heights))]
+    parts = [  # the prior of all trials is sought once
+        run_seconds(_candidate(one), Extent(extent.geometry, first, not isinstance(one, PreparedMethod)), now)
+        for one in candidates
+    ]
     parts.append(run_seconds(_candidate(candidates[-1]), extent, now))
     return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
 
