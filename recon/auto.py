@@ -73,7 +73,8 @@ class Auto:
         wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
         if wider and is_wider(problem):
             name = self.candidates[wider[0]].name
-            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it", False
+            why = "views do not fall to zero at their edges, as of a sample wider than the field"
+            return wider[0], f"{why}, and only {name} models what is beyond it", False
         part, where = part_of(problem)
         if part is None:
             return last, where, False
