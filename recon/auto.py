@@ -19,7 +19,6 @@ from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
 from recon.trials import of_views, part_of, predicts_best
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out import columns_of_matter
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct, prior_of
 
@@ -33,8 +32,7 @@ class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
     The part is a slab of 32 rows where most matter is. A cone's part is the rows in its middle, or all rows at half the
-    resolution. One of eight views is held out. Of methods that predict as well within one standard error, view by view,
-    the first is taken, which is the simplest and cheapest (`recon.voxels.held_out.simplest`). There is no trial with
+    resolution. One of eight views is held out. The method that leaves least of these is taken. There is no trial with
     fewer than 16 views, or of a sample wider than the field: the last one takes these. docs/choosing.md has reasons.
 
     Attributes:
@@ -69,13 +67,14 @@ class Auto:
         """Number of the chosen method, the reason, and whether there were trials.
 
         The prior is sought once, on the whole, and `decide` takes it for the chosen method. (From the part's fewer
-        views it costs 0.4 dB on a walnut.) A fit seeks its own, since it may take matter beyond the box off the views.
+        views it costs 0.4 dB on a walnut.)
         """
         last = len(self.candidates) - 1
         wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
         if wider and is_wider(problem):
             name = self.candidates[wider[0]].name
-            return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it", False
+            why = "views do not fall to zero at their edges, as of a sample wider than the field"
+            return wider[0], f"{why}, and only {name} models what is beyond it", False
         part, where = part_of(problem)
         if part is None:
             return last, where, False
@@ -83,11 +82,10 @@ class Auto:
         same_pixels = part.geometry.pixel_pitch == problem.geometry.pixel_pitch
         if same_pixels and any(isinstance(method, PnpDct) for method in self.candidates):
             prior = prior_of(problem, _trial_of_prior(control, problem.geometry.n_views))
-        at, residuals = predicts_best(part, self.candidates, control, prior=prior, on_voxels=_without_air(part))
+        at, residuals = predicts_best(part, self.candidates, control, prior=prior)
         if at is None:
             return last, residuals, False
-        if not isinstance(self.candidates[at], ChoosingMethod):
-            decide.preset(prior)
+        decide.preset(prior)
         return at, f"residual of views held out, {where}: {residuals}", True
 
     def toy(self) -> Self:
@@ -116,15 +114,3 @@ def _trial_of_prior(control: RunControl, n_views: int) -> Callable[[], bool]:
         return control.should_stop is not None and control.should_stop()
 
     return on_trial
-
-
-def _without_air(part: ReconProblem) -> ReconProblem | None:
-    """The part without the columns of air far beside the sample; None: there are hardly any."""
-    weights = part.use.weights
-    narrow = columns_of_matter(part.geometry, part.grid, masked(part.projections, weights)[0])
-    if narrow is None:
-        return None
-    cols, views, box = narrow
-    use = replace(part.use, weights=None if weights is None else np.ascontiguousarray(weights[..., cols]))
-    data = np.ascontiguousarray(part.projections[..., cols])
-    return replace(part, projections=data, geometry=views, grid=box, use=use)

@@ -108,8 +108,13 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
         else:
             seconds = _of_direct(method, extent, now)
         return RunTime(seconds, seconds)
-    first = Extent(extent.geometry, [min(32, max(extent.heights))])
-    parts = [run_seconds(_candidate(candidate), first, now) for candidate in candidates]
+    first = [min(32, max(extent.heights))]
+    parts = [  # the prior of all trials is sought once
+        run_seconds(
+            _candidate(candidate), Extent(extent.geometry, first, not isinstance(candidate, PreparedMethod)), now
+        )
+        for candidate in candidates
+    ]
     parts.append(run_seconds(_candidate(candidates[-1]), extent, now))
     return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
 
