@@ -155,7 +155,9 @@ class _Views:
         views, start = geometry.select(used), method.gaussians
         pixel_grid = Grid.for_fit(geometry, problem.grid)
         usual = default_count(views, pixel_grid.voxel_size)
-        count = start.n if isinstance(start, Gaussians) else start or usual
+        count = start.n if isinstance(start, Gaussians) else usual if start is None else start
+        if count < 1:
+            raise ValueError(f"a model needs at least one Gaussian, got {count}")
         joined = method.fit.joined_pixels or joined_for(
             pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
         )  # fmt: skip

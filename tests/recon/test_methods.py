@@ -139,7 +139,7 @@ class TestConformance(MethodConformance):
     def method(self, request: pytest.FixtureRequest) -> Method:
         fit = recon.R2(steps=40, gaussians=200, finish=2)
         if request.param == "auto":
-            return recon.Auto((fit, recon.FistaTv(iterations=3), recon.Fbp()))
+            return recon.Auto((recon.Fbp(), recon.FistaTv(iterations=3), fit))
         method = methods.by_name(request.param)
         if request.param in FIELDS:
             request.getfixturevalue("one_thread")
