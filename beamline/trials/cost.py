@@ -60,6 +60,8 @@ def expected_seconds(trial: Trial, geometry: Geometry, sweep: float = 1.0) -> fl
         length = method.planned_steps or 0
     elif hasattr(method, "iterations"):
         length = method.iterations
+        if length is None and hasattr(method, "most_iterations"):
+            length = method.most_iterations
     elif method.traits.direct:
         length = 0
     else:

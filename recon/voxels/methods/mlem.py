@@ -38,6 +38,11 @@ class Mlem:
 
     iterations: int | None = None
 
+    @property
+    def most_iterations(self) -> int:
+        """As many as counts held out may ask for."""
+        return UPDATES
+
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return _run(self, problem, control, 1)
 
@@ -58,6 +63,11 @@ class Osem:
 
     iterations: int | None = None
     subsets: int = 4
+
+    @property
+    def most_iterations(self) -> int:
+        """As many as counts held out may ask for."""
+        return max(1, UPDATES // self.subsets)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return _run(self, problem, control, min(self.subsets, problem.geometry.n_views))
