@@ -136,7 +136,7 @@ def digests(case: str, folder: Path) -> dict[str, str]:
             found["scan"] = _digest(file["/entry/instrument/detector/data"][()])
     follow = "--follow" in options
     with ExitStack() as spying, _one_thread():
-        for module in ("finished", "follow"):
+        for module in ("offline", "follow"):
             spying.enter_context(_spied(f"beamline.reconstruct.{module}", found))
         method = [] if follow else ["-m", "fbp"]
         _run("recon", str(path), *method, *options, "--no-report", "-o", str(folder / "out.h5"))
