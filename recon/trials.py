@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F64, median_deviation
+from recon.base.arrays import F64
 from recon.base.binning import bin_views
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -19,14 +19,13 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.finish import beyond_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import LEAST_VIEWS, busiest_rows, middle_of_cone, slab_of, split_views
+from recon.voxels.held_out import LEAST_VIEWS, busiest_rows, middle_of_cone, residuals_by_view, slab_of, split_views
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
-_MATTER = 0.1  # share of the largest line integrals
 
 
 class TrialsVerdict(NamedTuple):
@@ -178,21 +177,11 @@ def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
 
 
 def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F64:
-    """What a result leaves of each view [view], negative values at zero; a fit also shows what no voxel can.
-
-    As `HeldOutTrial.residuals`: the root mean square, of a cone the median deviation on rays through matter.
-    """
+    """`residuals_by_view` of a result, negative values at zero; a fit also shows what no voxel can."""
     grid = made.volume.grid
-    left = problem.projections - Projector(problem.geometry, grid).forward(np.maximum(made.volume.data, 0))
+    differences = problem.projections - Projector(problem.geometry, grid).forward(np.maximum(made.volume.data, 0))
     if made.gaussians is not None and isinstance(method, FitMethod):
         start = voxelize(made.gaussians, grid, truncation=method.fit.truncation).numpy()
         beyond = beyond_voxels(made.gaussians, problem.geometry, Volume(start, grid), method.fit)
-        left -= 0 if beyond is None else beyond
-    left = whitened(left, problem.use.weights)
-    if problem.geometry.is_cone:
-        left[problem.projections <= _MATTER * np.nanpercentile(problem.projections, 99)] = np.nan
-        found = np.array([median_deviation(view) for view in left if np.isfinite(view).any()])
-    else:
-        squares = [np.nanmean(np.square(view, dtype=np.float64)) for view in left if np.isfinite(view).any()]
-        found = np.sqrt(np.array(squares))
-    return found if found.size else np.full(1, np.inf)
+        differences -= 0 if beyond is None else beyond
+    return residuals_by_view(whitened(differences, problem.use.weights), problem.projections, problem.geometry)

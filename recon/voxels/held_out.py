@@ -1,7 +1,8 @@
-"""Views held out: the one rule that chooses strengths, priors, first volumes and methods, and the trials it judges by.
+"""Views held out: how strengths, priors and methods are chosen, and the trials that judge them.
 
 One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
-view held out is measured. Candidates are compared view by view, since views differ more than candidates do. Of those
+view held out is measured. A strength and the method of `auto` are those of the least residual. Where a candidate is
+simpler and cheaper than another, they are compared view by view, since views differ more than candidates do: of those
 within one standard error of the best, the simplest is taken.
 """
 
@@ -37,11 +38,9 @@ CHOICE_SWEEPS = 4 * _SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
 _ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
-_AIR, _BESIDE, _NARROWER = (
-    0.03,
-    0.05,
-    0.9,
-)  # shares: of the largest line integral; of the matter's width; of the columns
+_AIR = 0.03  # of the largest line integral: columns below see air
+_BESIDE = 0.05  # of the width of the matter: air that trials see on either side
+_NARROWER = 0.9  # of the columns: wider matter is not worth a cut
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 
 
@@ -61,6 +60,26 @@ def beyond_chance(gains: F64, errors: float) -> bool:
     """The mean of gains [view held out] is more than so many of its standard errors, by their scatter."""
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
     return float(gains.mean()) > errors * scatter
+
+
+def residuals_by_view(differences: F32, views: F32, geometry: Geometry) -> F64:
+    """[view] what a volume leaves of each view, without views of which no ray counts; infinite where none is left.
+
+    The root mean square. Of a cone the median deviation on rays through matter: coarse voxels cannot explain the edges
+    of its views, and a volume that tries has ripples.
+
+    Args:
+        differences: [view, ...] of the volume's projection from `views`, rays weighed; NaN does not count. Overwritten.
+        views: [view, ...] line integrals.
+    """
+    if geometry.is_cone:
+        differences[views <= _MATTER * np.nanpercentile(views, 99)] = np.nan
+    counting = [view for view in differences if np.isfinite(view).any()]
+    if not counting:
+        return np.full(1, np.inf)
+    if geometry.is_cone:
+        return np.array([median_deviation(view) for view in counting])
+    return np.sqrt(np.array([np.nanmean(np.square(view, dtype=np.float64)) for view in counting]))
 
 
 def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -334,12 +353,10 @@ class HeldOutTrial:
         return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all
 
     def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
-        """[view held out] what a volume [y, x, z] leaves of it; infinite where the trials were ended.
+        """`residuals_by_view` of a volume [y, x, z]; infinite where the trials were ended.
 
-        `beyond`: [view held out, col, row], what its model adds to its projection.
-
-        The root mean square, rays weighed. Of a cone the median deviation on rays through matter: coarse voxels cannot
-        explain the edges of its views, and a volume that tries has ripples.
+        Args:
+            beyond: [view held out, col, row], what its model adds to its projection.
         """
         unseen = self.unseen
         if self._ended:
@@ -347,9 +364,4 @@ class HeldOutTrial:
         differences = unseen.projector.forward_lines(x) - unseen.data
         if beyond is not None:
             differences += beyond
-        differences = whitened(differences, unseen.weight)
-        if unseen.projector.geometry.is_cone:
-            differences[unseen.data <= _MATTER * np.percentile(unseen.data, 99)] = np.nan
-            return np.array([median_deviation(view) for view in differences if np.isfinite(view).any()])
-        squares = [np.nanmean(np.square(view, dtype=np.float64)) for view in differences if np.isfinite(view).any()]
-        return np.sqrt(np.array(squares))
+        return residuals_by_view(whitened(differences, unseen.weight), unseen.data, unseen.projector.geometry)

@@ -28,6 +28,7 @@ from recon.voxels.held_out import (
     busiest_rows,
     columns_of_matter,
     preferred_strength,
+    residuals_by_view,
     simplest,
     slab_of,
     split_views,
@@ -258,3 +259,12 @@ def test_trials_see_the_columns_with_matter() -> None:
     np.testing.assert_allclose(again, images[:, :, cols], atol=1e-4 * images.max())
     full = np.ones_like(images)
     assert columns_of_matter(views, grid, full) is None
+
+
+def test_residuals_leave_out_rays_and_views_that_do_not_count() -> None:
+    views, differences = np.ones((3, 2, 4), np.float32), np.full((3, 2, 4), 2.0, np.float32)
+    differences[0, 0], differences[1] = np.nan, np.nan
+    parallel = Geometry.parallel(np.zeros(3), (2, 4), pixel_pitch=1.0)
+    np.testing.assert_allclose(residuals_by_view(differences.copy(), views, parallel), [2.0, 2.0])
+    cone = Geometry.cone(np.zeros(3), (2, 4), sod=10.0, sdd=20.0, pixel_pitch=1.0)
+    assert np.isinf(residuals_by_view(differences.copy(), np.zeros_like(views), cone)).all()  # all rays miss matter
