@@ -1,4 +1,4 @@
-"""Sparse patches beside total variation and the fit, on scans for which it was tuned, and on scans looked at once.
+"""Sparse patches beside total variation, the fit and the automatic choice, on scans for which it was tuned, and on scans looked at once.
 
 Run with  pytest -m bench -s tests/bench/test_patch_prior.py -k tuned  (or held_back). 50 views, 10⁵ photons, 40 x 128²
 voxels or fewer, from volumes of twice the resolution. PSNR in dB and CPU seconds; the walnut and Diamond are measured,
@@ -25,7 +25,7 @@ from tests.bench import quality_cases
 from tests.bench.quality_cases import SLABS, Case
 
 F32 = NDArray[np.float32]
-METHODS = recon.FistaTv(), recon.R2(), recon.PnpDct()
+METHODS = recon.FistaTv(), recon.PnpDct(), recon.R2(), recon.Auto()
 VIEWS, PHOTONS = 50, 1e5
 
 
