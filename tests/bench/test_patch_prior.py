@@ -1,4 +1,4 @@
-"""Sparse patches beside total variation, the fit and the automatic choice, on scans for which it was tuned, and on scans looked at once.
+"""Sparse patches beside total variation, the fit and auto, on scans that it was tuned on, and on scans held back.
 
 Run with  pytest -m bench -s tests/bench/test_patch_prior.py -k tuned  (or held_back). 50 views, 10⁵ photons, 40 x 128²
 voxels or fewer, from volumes of twice the resolution. PSNR in dB and CPU seconds; the walnut and Diamond are measured,
