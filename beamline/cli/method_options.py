@@ -75,7 +75,7 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
     Args:
         name: in `recon.methods`, or of `recon.Auto`.
         settings: values by path.
-        any_setting: further ones, all of which the method must have.
+        any_setting: values by path, as `--set` gives them; the method must have every one of these settings.
     """
     if name == AUTO:
         from recon.auto import Auto  # here, because it loads all methods

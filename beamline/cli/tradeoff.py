@@ -67,7 +67,12 @@ def listed(value: str) -> tuple[str, ...]:
     type=click.Path(path_type=Path, dir_okay=False),
     help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
 )
-@click.option("--states", metavar="NAME,NAME", default="", help="With --spectra: two materials that are states of one.")
+@click.option(
+    "--states",
+    metavar="NAME,NAME",
+    default="",
+    help="With --spectra: two materials that are two states of the same one.",
+)
 @click.option(
     "--methods",
     callback=parsed(listed),
