@@ -222,6 +222,10 @@ row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS
 """The options of methods for every row of a table: length and start of the work."""
 equal_time = option(
     "--seconds",
+    excludes={
+        "iterations": "give one of them",
+        **dict.fromkeys(("volumes", "spectra"), "it is of methods that make one volume"),
+    },
     type=POSITIVE,
     metavar="EACH",
     help="Compare in equal time: each reconstruction ends when so many seconds are over. Direct methods take what they "
