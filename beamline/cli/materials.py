@@ -46,7 +46,8 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "--states",
     metavar="NAME,NAME",
     default="",
-    help="Two materials that are states of one, as a fresh and a charged oxide: the share of the second is smooth.",
+    help="Two materials that are two states of the same one, as a fresh and a charged oxide: the share of the second "
+    "is smooth.",
 )
 @selection_options
 @heading(OUTPUT)

@@ -75,7 +75,7 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
     Args:
         name: in `recon.methods`, or of `recon.Auto`.
         settings: values by path.
-        any_setting: further ones, all of which the method must have.
+        any_setting: values by path, as `--set` gives them; the method must have every one of these settings.
     """
     if name == AUTO:
         from recon.auto import Auto  # here, because it loads all methods
@@ -222,6 +222,10 @@ row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS
 """The options of methods for every row of a table: length and start of the work."""
 equal_time = option(
     "--seconds",
+    excludes={
+        "iterations": "give one of them",
+        **dict.fromkeys(("volumes", "spectra"), "it is of methods that make one volume"),
+    },
     type=POSITIVE,
     metavar="EACH",
     help="Compare in equal time: each reconstruction ends when so many seconds are over. Direct methods take what they "

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import click
@@ -106,7 +107,9 @@ def declared(command: click.Command) -> dict[str, Declared]:
     return {param.name: param for param in command.params if isinstance(param, Declared) and param.name}
 
 
-def refuse_contradictions(command: click.Command, given: Collection[str], shown: Mapping[str, str]) -> None:
+def refuse_contradictions(
+    command: click.Command, given: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
+) -> None:
     """Raises UsageError for two options that do not go together, or one without another that it needs.
 
     Args:

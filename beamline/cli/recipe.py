@@ -51,6 +51,11 @@ def given(ctx: click.Context) -> dict[click.Option, Any]:
     return typed
 
 
+def names_given(ctx: click.Context) -> set[str]:
+    """The parameter names of the options that the user gave."""
+    return {str(option.name) for option in given(ctx)}
+
+
 def _is_of_one_call(option: click.Option) -> bool:
     return isinstance(option, Declared) and option.of_one_call
 

@@ -25,7 +25,7 @@ from beamline.cli.options import (
     refuse_shared,
     require_there,
 )
-from beamline.cli.recipe import given, recipe_text, repeating
+from beamline.cli.recipe import names_given, recipe_text, repeating
 from beamline.cli.recon_options import SHEET, recon_options
 from beamline.cli.recon_time import recon_series
 from beamline.cli.selection_options import chosen, chosen_steps
@@ -107,18 +107,17 @@ def _checked_method(context: click.Context, method: str | None, axes: AxisRange 
     Raises:
         UsageError: they do not.
     """
-    names_given = {str(each.name) for each in given(context)}
-    names_given |= {"axis_trials"} if axes is not None else set()
+    asked = names_given(context) | ({"axis_trials"} if axes is not None else set())
     if slabs is not None:
-        names_given = names_given - {"resume"} | {"slabs"}
+        asked = asked - {"resume"} | {"slabs"}
     values = context.params
     method = preset_of(method, values["preset"])
     if method is None:
         of_a_method = {name for name, each in declared(context.command).items() if each.owner is not None}
-        of_fits = values["follow"] or values["any_setting"] or (of_a_method & names_given) - {"budget"}
+        of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
         method = DEFAULT if of_fits else AUTO
-    refuse_contradictions(context.command, names_given, {"axis_trials": "--axis try", "slabs": f"--resume {slabs}"})
-    refuse_for_method(context, method, names_given)
+    refuse_contradictions(context.command, asked, {"axis_trials": "--axis try", "slabs": f"--resume {slabs}"})
+    refuse_for_method(context, method, asked)
     for step in chosen_steps(values) if values["follow"] else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)

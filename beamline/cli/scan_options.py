@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import POSITIVE, of_views, parsed, together
+from beamline.cli.options import POSITIVE, of_views, option, parsed, together
 
 if TYPE_CHECKING:
     from beamline.projections.scan_statistics import LightAsked
@@ -61,7 +61,12 @@ scan_options = together(
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""
 
 light_options = together(
-    click.option("--photons-per-count", type=POSITIVE, help="X-ray photons at the sample that make a count."),
+    option(
+        "--photons-per-count",
+        excludes={"spectra": "of several energies the dose is counted in frames"},
+        type=POSITIVE,
+        help="X-ray photons at the sample that make a count.",
+    ),
     click.option("--dose-in", metavar="MATERIAL", help="With it: the absorbed dose in a material or formula."),
 )
 """What `light_asked` takes."""

@@ -10,8 +10,8 @@ import click
 
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
-from beamline.cli.options import SEED, dry_option, json_option, scan_argument
-from beamline.cli.recipe import repeating
+from beamline.cli.options import SEED, dry_option, json_option, refuse_contradictions, scan_argument
+from beamline.cli.recipe import names_given, repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown, print_dry_run
@@ -105,10 +105,9 @@ def study(
     from beamline.trials.study import StudyLayout, StudyOptions, planned_study, run_study
 
     methods = tuple(dict.fromkeys(methods))
-    lengths = [name for name in ("steps", "iterations") if seconds is not None and values[name] is not None]
-    if lengths:
-        raise click.UsageError(f"--{lengths[0]} and --seconds exclude each other. Give one of them.")
-    settings = row_settings(click.get_current_context().command, methods, values)
+    context = click.get_current_context()
+    refuse_contradictions(context.command, names_given(context))
+    settings = row_settings(context.command, methods, values)
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_{which}")
     options = StudyOptions(
@@ -120,7 +119,7 @@ def study(
         filter=ramp,
         draws=draws,
         seed=seed,
-        command=repeating(click.get_current_context(), file, folder),
+        command=repeating(context, file, folder),
     )
     if dry:
         print_dry_run(partial(planned_study, options), folder, as_json)

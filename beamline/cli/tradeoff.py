@@ -11,8 +11,17 @@ import click
 
 from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import POSITIVE, SEED, dry_option, json_option, names_in, parsed
-from beamline.cli.recipe import repeating
+from beamline.cli.options import (
+    POSITIVE,
+    SEED,
+    dry_option,
+    json_option,
+    names_in,
+    option,
+    parsed,
+    refuse_contradictions,
+)
+from beamline.cli.recipe import names_given, repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown, print_dry_run
@@ -28,6 +37,9 @@ def listed(value: str) -> tuple[str, ...]:
     if unknown:
         raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
     return wanted
+
+
+_OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each energy."
 
 
 @click.command(
@@ -47,27 +59,37 @@ def listed(value: str) -> tuple[str, ...]:
 )
 @heading(DATA)
 @click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
+@option(
     "--truth",
+    excludes=dict.fromkeys(
+        ("volumes", "spectra"), "it is one volume; views in time, or of several energies, show several"
+    ),
     metavar="FILE[:A:B]",
     help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views held out.",
 )
 @light_options
 @selection_options
 @heading(METHOD)
-@click.option(
+@option(
     "--time",
     "volumes",
+    excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
     type=click.IntRange(min=2),
     metavar="N",
     help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
 )
-@click.option(
+@option(
     "--spectra",
     type=click.Path(path_type=Path, dir_okay=False),
     help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
 )
-@click.option("--states", metavar="NAME,NAME", default="", help="With --spectra: two materials that are states of one.")
+@option(
+    "--states",
+    needs=("spectra", _OF_MATERIALS),
+    metavar="NAME,NAME",
+    default="",
+    help="With --spectra: two materials that are two states of the same one.",
+)
 @click.option(
     "--methods",
     callback=parsed(listed),
@@ -131,9 +153,10 @@ def tradeoff(
     from beamline.trials.runner import ComparedScan
     from beamline.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
 
-    _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
-    if seconds is not None and (volumes is not None or spectra is not None):
-        raise click.UsageError("--seconds is of methods that make one volume: leave out --time and --spectra.")
+    context = click.get_current_context()
+    refuse_contradictions(context.command, names_given(context))
+    if spectra is None and len(files) > 1:
+        raise click.UsageError(f"A comparison of {len(files)} files {_OF_MATERIALS}")
     folder = output or Path(f"{files[0].stem}_tradeoff")
     with events_shown(as_json) as sink:
         if spectra is not None:
@@ -147,7 +170,7 @@ def tradeoff(
             max_seconds=max_seconds,
             seconds=seconds,
             seed=seed,
-            command=repeating(click.get_current_context(), files, folder),
+            command=repeating(context, files, folder),
         )
         if not dry:
             table = run_tradeoff(options, sink, SystemClock(), begun=begun)
@@ -160,23 +183,3 @@ def tradeoff(
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"
         raise ScanStopped(f"The trade-off was stopped after {counts} trials; {folder} holds them.")
-
-
-def _refuse_unlike(
-    files: tuple[Path, ...],
-    truth: str | None,
-    photons_per_count: float | None,
-    volumes: int | None,
-    spectra: Path | None,
-    states: str,
-) -> None:
-    """Raises UsageError for options that exclude each other."""
-    if spectra is None and (len(files) > 1 or states):
-        what = "--states" if states else f"{len(files)} files"
-        raise click.UsageError(f"{what}: give --spectra, with what pure materials attenuate at each energy.")
-    if spectra is not None and volumes is not None:
-        raise click.UsageError("--time is of one scan, --spectra of scans at several energies: give one of them.")
-    if photons_per_count is not None and spectra is not None:
-        raise click.UsageError("--photons-per-count is of one scan: --spectra counts the dose in frames.")
-    if truth is not None and (spectra is not None or volumes is not None):
-        raise click.UsageError("--truth is one volume; views in time, or of several energies, show several.")

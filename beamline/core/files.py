@@ -87,8 +87,8 @@ def leads_away(path: Path) -> bool:
 def same_file(first: os.stat_result, second: os.stat_result) -> bool:
     """Whether two looks were at the same file or folder.
 
-    Some file systems of a network number a file anew at each look. Then device, owner, mode, size and the times of the
-    last changes tell, the latter of which no program sets.
+    Some network file systems give a file a new inode number at each look. Then device, owner, mode, size and the times
+    at which content and inode changed are compared; no program can set the second of these.
     """
     fields = "st_dev", "st_uid", "st_mode", "st_size", "st_mtime_ns", "st_ctime_ns"
     return os.path.samestat(first, second) or all(getattr(first, name) == getattr(second, name) for name in fields)

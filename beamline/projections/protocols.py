@@ -90,15 +90,11 @@ class ViewMotion(Protocol):
 
     Attributes:
         frames: int64 [view], the rows of the file that are used.
-        said: what was done, in a line; empty: nothing.
-        done: what the step did.
+        done: what the step did; its sentence becomes a warning.
     """
 
     @property
     def frames(self) -> NDArray[np.int64]: ...
-
-    @property
-    def said(self) -> str: ...
 
     @property
     def done(self) -> StepDone: ...
@@ -116,7 +112,6 @@ class Unmoved:
     """
 
     frames: NDArray[np.int64]
-    said: ClassVar[str] = ""
     done: ClassVar[StepDone] = StepDone(parameters={})
 
     def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:

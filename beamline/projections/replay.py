@@ -254,8 +254,8 @@ def _saturation(source: ScanSource) -> float:
 
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on, with NaN for an angle that is none. Their exposure is 1 s where it is not known, so that
-    those of views and flats agree."""
+    """Frames from `first` on. An angle that no stage reaches becomes NaN. An unknown exposure becomes 1 s, so that
+    views and flats agree."""
     for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
         angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
         yield replace(frame, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)

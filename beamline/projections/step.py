@@ -18,7 +18,7 @@ class NamedStep(Protocol):
     """What a selection knows of a step; the protocols in `beamline.projections.protocols` say what it can do.
 
     Attributes:
-        name: by which events and `PreparedProjections.done` know it.
+        name: of the step in events, and its key in `PreparedProjections.done`.
         follows: names of steps that come before it.
     """
 

@@ -17,7 +17,7 @@ from recon.prep.tilt import FEWEST_BANDS, TiltEstimate, find_tilt
 
 MATTERS = 0.5
 """Pixels over the rows from which a tilt doubles edges."""
-_BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # looked at for a warning
+_BANDS, _BAND_ROWS, _VIEWS = 8, 2, 90  # bands of rows, rows of each, and views that the warning is judged by
 _FEWEST_ROWS = 32  # half a pixel over fewer rows is no tilt of a stage
 _SURE = 3.0  # standard deviations from which a tilt is significant
 BandsDone = Callable[[int, int], None]  # (n, N): so many bands of rows are corrected, of so many

@@ -76,7 +76,7 @@ class UsableViews:
         weights: float32 [frame of the file], of each row that is a view; None: one for all.
         left_out: views with an alarm, which are not among them.
         said: what was done, in a line; empty where no view is flagged.
-        flags: of all frames, which this follows from; None where there are none.
+        flags: of all frames, which decide the other fields unless they are ignored; None: the file has none.
         regions: parts of views that weigh less, in views that are used otherwise.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
     """

@@ -40,10 +40,20 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     geometry = geometry_of(source, selection, axis_col, source.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
+    return with_rays(source, selection, geometry)[0]
+
+
+def with_rays(source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, dict[str, StepDone]]:
+    """The geometry of views after every `RayStep`, and what these steps did, by name.
+
+    Raises:
+        ConfigError: a step does not fit the scan.
+    """
+    done = dict[str, StepDone]()
     for step in in_order(selection):
         if isinstance(step, RayStep):
-            geometry, _ = step.rays(source, selection, geometry)
-    return geometry
+            geometry, done[step.name] = step.rays(source, selection, geometry)
+    return geometry, done
 
 
 @dataclass(eq=False)
@@ -80,8 +90,8 @@ class ViewGeometry:
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
             motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
-            if motion.said:
-                warn(motion.said)
+            if motion.done.said:
+                warn(motion.done.said)
             usable = usable.only(motion.frames)
         return usable
 
@@ -97,8 +107,7 @@ class ViewGeometry:
         geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
-        for step in (step for step in in_order(self.selection) if isinstance(step, RayStep)):
-            geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
+        geometry, self.rays = with_rays(self.source, part, geometry)
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:

@@ -122,7 +122,7 @@ class BatchPlan:
         return [
             *rows,
             "",
-            f"{'scans':<10}{len(self.rows)}, of which {waiting} wait: {size(sum(self.sizes.values()))} of files",
+            f"{'scans':<10}{len(self.rows)}; {waiting} to be reconstructed, {size(sum(self.sizes.values()))} of files",
             f"{'time':<10}{time if waiting else 'none: every scan has a volume'}",
             f"{'output':<10}{self.folder}: {TABLE}, and a folder a scan (not written now)",
         ]

@@ -41,8 +41,8 @@ class MaterialOptions:
 
     Attributes:
         register: find where the sample stood in each scan, and how the image is shifted and magnified; correct it.
-        states: names of two materials that are states of one, so that the share of the second is smooth within matter;
-            empty: there are none.
+        states: names of two materials that are two states of the same one, so that the share of the second is smooth
+            within matter; empty: no such pair.
     """
 
     register: bool = False

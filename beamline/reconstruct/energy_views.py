@@ -58,7 +58,11 @@ class Spectra:
         return np.array([np.interp(energy_kev, self.energies, column) for column in self.attenuation.T])
 
     def states(self, names: Sequence[str]) -> tuple[int, int] | None:
-        """Two materials that are states of one, by name; None without names. ConfigError for others."""
+        """Indices of two materials that are two states of the same one, by their names; None without names.
+
+        Raises:
+            ConfigError: these are not the names of two materials.
+        """
         if not names:
             return None
         if len(set(names)) != 2 or len(names) != 2 or not set(names) <= set(self.names):

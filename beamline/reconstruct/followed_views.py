@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.projections.corrections.flags import Flags, usable_views
-from beamline.projections.protocols import RayStep
-from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
+from beamline.projections.view_geometry import with_rays
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -77,12 +76,8 @@ class FollowedViews:
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, dict[str, StepDone]]:
         """The geometry of views with the motion of the stage in their exposures, and what its steps did, by name."""
-        done = dict[str, StepDone]()
         geometry = geometry_of(self.source, self.selection, axis_col, self.source.angles[view_ids])
-        for step in in_order(self.selection):
-            if isinstance(step, RayStep):
-                geometry, done[step.name] = step.rays(self.source, self.selection, geometry)
-        return geometry, done
+        return with_rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """[view] radians for the fit: in the middle of the exposure, of the middle row. The fit knows no motion."""

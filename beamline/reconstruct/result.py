@@ -115,7 +115,7 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
 
 
 def _left_in_file(record: ReconRecord, target: OutputPaths) -> VolumeInFile:
-    """The volume as it stays: whoever keeps the record holds no voxels, and no file open, until they are asked for."""
+    """The volume by its file: a kept record holds neither voxels nor an open file until the voxels are used."""
 
     def read() -> Volume:
         with opened_volume(target.output) as stored:

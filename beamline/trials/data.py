@@ -35,8 +35,8 @@ class TrialData:
         of_view: [view] time in s, or number of the energy, of these views, then of those held out; None: all show the
             same volume.
         sections: [energy, material] attenuation of pure materials, 1/mm; None: views have times, or all show the same.
-        states: numbers of two materials that are states of one; empty: there are none.
-        reference: a volume on the same grid that all trials are compared with, beside the truth; None: none.
+        states: indices of two materials that are two states of the same one; empty: no such pair.
+        reference: a volume on the same grid that every trial is compared with, in addition to the truth; or None.
         regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
     """
 

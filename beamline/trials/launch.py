@@ -16,7 +16,7 @@ from beamline.core.process import ChildProcess, Ending, json_object, last_line, 
 from beamline.trials.trial import Outcome, Status, Trial
 
 DATA = "data"
-"""Folder of `Data` in the one of all trials."""
+"""Name of the folder with the `TrialData` that all trials read, in the folder of the results."""
 
 
 def command(job: Path) -> Sequence[str]:

@@ -101,7 +101,7 @@ class Planned:
         table: before any trial is done.
         layout: of the table.
         started: the event that says so.
-        reference: makes the volume that all trials are compared with, beside the truth; None: there is none.
+        reference: the trial whose volume every other trial is compared with, in addition to the truth; or None.
     """
 
     table: TrialTable
@@ -284,5 +284,5 @@ def _no_time(needed: float, remaining: float) -> str:
     """Why a trial of so many seconds is not begun; empty: there is time."""
     if needed < remaining:
         return ""
-    about = f"it would take about {needed:.0f} s, of which {remaining:.0f} s were left"
+    about = f"it would take about {needed:.0f} s, and only {remaining:.0f} s were left"
     return f"not begun: {about if remaining > 0 else 'no time was left'}"

@@ -49,7 +49,7 @@ class SeveralVolumes:
         volumes: in time, to compare a fit of all of them; 0: none.
         others: scans of the same sample at other energies.
         spectra: table of what pure materials attenuate.
-        states: names of two materials that are states of one; empty: there are none.
+        states: names of two materials that are two states of the same one; empty: no such pair.
     """
 
     volumes: int = 0

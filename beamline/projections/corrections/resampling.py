@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from recon.prep.correct import Projections
 
 _MOST_TILT_DEG = 45.0
-_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # by which the tilt is found
+_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # bands of rows, rows of each, and views that --tilt auto measures
 _NOTHING = 0.05  # px over the rows, not worth new pixels
 _ROUNDS = 5
 _COPIES = 20  # float32 copies of all bands while their axes are found

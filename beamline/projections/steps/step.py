@@ -1,4 +1,4 @@
-"""Names that a plug-in of a correction imports, at the place where it has found them so far."""
+"""Names that a plug-in of a correction may import from here; they are defined in `protocols` and `step`."""
 
 from beamline.projections.protocols import (
     PlaceStep,

@@ -51,7 +51,9 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
     given = ("batch", "*scan.h5", "a/*.h5", "cut.h5", "--config", "recipe.yaml", "-o", "out")
 
     planned = beamline(*given, "--dry-run")
-    assert planned.exit_code == 0 and "3, of which 3 wait" in planned.stdout and "not known before" in planned.stdout
+    assert (
+        planned.exit_code == 0 and "3; 3 to be reconstructed" in planned.stdout and "not known before" in planned.stdout
+    )
     assert not Path("out").exists()
     first = beamline(*given)
     assert first.exit_code == 5
