@@ -25,8 +25,8 @@ from beamline.reconstruct.energy_views import Spectra
 from beamline.reconstruct.slabs import SHARE
 from beamline.report.figures import downwards, dpi_for, planes, png
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
 
 _SLAB = 16  # slices read at a time

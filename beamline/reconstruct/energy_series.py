@@ -20,8 +20,8 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.energy_views import Spectra, energy_views
 from beamline.reconstruct.progress import sweeps_told
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import write_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
 from recon.base.volume import Grid, Volume
 from recon.energy_fit import EnergyViews

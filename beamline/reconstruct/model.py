@@ -15,9 +15,10 @@ from beamline.core.files import whole_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.ingest import PER_FLUSH, complete
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import ScanEnding
-from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from beamline.storage.writers.recon_file import opened_reconstruction
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry

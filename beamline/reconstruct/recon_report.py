@@ -16,7 +16,7 @@ from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, price_of_decibel, price_text, residual_curve, views_grew
 from beamline.report.time_curves import quality_against_time
-from beamline.storage.writers.recon_file import Value
+from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE

@@ -21,8 +21,8 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import for_part
+from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
-from beamline.storage.writers.recon_file import ReconRecord, Value
 from recon.base.decisions import Decisions
 from recon.base.method import Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of

@@ -28,8 +28,9 @@ from beamline.reconstruct.series_report import FACTORS, series_page
 from beamline.reconstruct.slabs import memory_of
 from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.recon_record import ReconRecord, VolumesInTime
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, VolumesInTime, write_reconstruction
+from beamline.storage.writers.recon_file import SUFFIXES, write_reconstruction
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.arrays import F32, F64, I64
