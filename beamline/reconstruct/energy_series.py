@@ -136,9 +136,9 @@ def _with_share(
     """`fit_share`, and whether it was stopped."""
     early = False
 
-    def go_on(left: int) -> bool:
+    def go_on(steps_left: int) -> bool:
         nonlocal early
-        told(SHARE_STEPS - left, SHARE_STEPS)
+        told(SHARE_STEPS - steps_left, SHARE_STEPS)
         early = stopping()
         return not early
 

@@ -279,11 +279,11 @@ def _pictures(
 
 def _of_wedges(unseen: Sequence[Wedge]) -> str:
     """Size and direction of the wedges, and what they do to the volume."""
-    said = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
+    directions = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
     size = math.degrees(sum(wedge.size for wedge in unseen))
     return (
-        f"{size:.0f}° of rays are in no view, those at {said} from x towards y (orange): edges along them are blurred, "
-        "and small things are drawn out across them."
+        f"{size:.0f}° of rays are in no view, those at {directions} from x towards y (orange): edges along them are "
+        "blurred, and small things are drawn out across them."
     )
 
 
