@@ -22,7 +22,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.recon_record import ReconRecord
 from drivers.base.clock import SystemClock
 from recon.auto import Auto
 from recon.base.choices import AUTO

@@ -160,8 +160,9 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     live = target.live_picture.name if target.live_picture.exists() else ""
     curve = [(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes]
     context = ReportContext(
-        facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live, psnr=curve
-    )
+        facts, selection, command, config.recon.seed, warnings, started, scan_flags=snapshots.flags, live_picture=live,
+        psnr=curve,
+    )  # fmt: skip
     write_result(made, prepared, ideal, target, context, outside, clock)
 
 

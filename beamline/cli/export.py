@@ -18,7 +18,7 @@ from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.storage.writers.recon_file import ReconRecord
+    from beamline.storage.recon_record import ReconRecord
 
 
 def window_of(text: str) -> tuple[float, float]:

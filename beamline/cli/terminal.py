@@ -41,7 +41,7 @@ from drivers.manual import Ask
 from recon.methods import BASELINE
 
 if TYPE_CHECKING:
-    from beamline.storage.writers.recon_file import ReconRecord
+    from beamline.storage.recon_record import ReconRecord
 
 LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
 SAY_EVERY = 0.2  # s between events on the progress of many frames

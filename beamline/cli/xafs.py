@@ -22,7 +22,7 @@ from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.monitor.view import PixelBox
+    from beamline.core.flag import PixelBox
     from beamline.xafs.results import XafsResult
     from beamline.xafs.series import SeriesResult
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.monitor.view import PixelBox
+    from beamline.core.flag import PixelBox
     from beamline.xafs.contrast import XafsCurve
     from beamline.xafs.series import Series, SeriesResult
 

@@ -26,9 +26,9 @@ KINDS: dict[str, list[type[Event]]] = {}
 _SPREAD = "spread"
 
 
-def _spread(of: Callable[[Any], Mapping[str, Any]] | None = None) -> Any:
+def _spread(of: Callable[[Any], Mapping[str, Any]] | None = None, **of_field: Any) -> Any:
     """A field whose own values stand in the line: a mapping, a dataclass, or what `of` makes of another value."""
-    return field(metadata={_SPREAD: of or _values_of})
+    return field(metadata={_SPREAD: of or _values_of}, **of_field)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, _spread))
@@ -221,7 +221,7 @@ class StateEntered(Event, event="state"):
 
     state: str
     message: str
-    more: Any = field(default_factory=dict, metadata={_SPREAD: _values_of})
+    more: Any = _spread(default_factory=dict)
 
 
 class BlockStarted(Event, event="block_started"):
@@ -388,7 +388,7 @@ class ReconStarted(Event, event="recon_started"):
     n_views: int
     axis_col: float
     again: bool | None = None
-    more: Mapping[str, Any] = field(default_factory=dict, metadata={_SPREAD: _values_of})
+    more: Mapping[str, Any] = _spread(default_factory=dict)
 
 
 class Listed(Event):

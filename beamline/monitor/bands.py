@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from beamline.core.flag import PixelBox
 from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import PixelBox
 from drivers.base.frame import Frame, FrameKind
 
 CALIBRATION = 5  # frames of a kind before a verdict

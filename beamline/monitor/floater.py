@@ -14,11 +14,12 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
+from beamline.core.flag import PixelBox
 from beamline.monitor.change import MOST_STEPS
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.track import Octave, SampleMotion, Track, tracks_of, with_view
-from beamline.monitor.view import CellGrid, PixelBox
+from beamline.monitor.view import CellGrid
 from drivers.base.frame import Frame
 
 OCTAVES = 4  # steps of 1, 2, 4 and 8 views

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.flag import PixelBox as PixelBox
+from beamline.core.flag import PixelBox
 from beamline.core.jit import njit
 from recon.base.arrays import median_deviation
 

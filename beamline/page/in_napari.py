@@ -13,9 +13,9 @@ import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage import hdf5
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volume_file import axes_of
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import ReconRecord
 
 
 def show(volumes: Sequence[Path], labels: Path | None) -> None:

@@ -105,15 +105,17 @@ class Recording:
 
     def flags(self) -> list[dict[str, Any]]:
         """Each flag of each frame: frame, check, whether it is an alarm, score, region [row, row, col, col] or null."""
-        found = read_flags(self._file, self.progress().frames)
+        frame_flags = read_flags(self._file, self.progress().frames)
         listed = []
-        for frame in np.flatnonzero(found.flagged):
-            bits = int(found.bits[frame])
-            for i, check in enumerate(found.legend):
+        for frame in np.flatnonzero(frame_flags.flagged):
+            bits = int(frame_flags.bits[frame])
+            for i, check in enumerate(frame_flags.legend):
                 if not bits >> check.bit & 1:
                     continue
-                score = float(found.scores[frame, i]) if found.scores is not None else np.nan
-                region = [int(edge) for edge in found.regions[frame, i]] if found.regions is not None else [-1]
+                score = float(frame_flags.scores[frame, i]) if frame_flags.scores is not None else np.nan
+                region = (
+                    [int(edge) for edge in frame_flags.regions[frame, i]] if frame_flags.regions is not None else [-1]
+                )
                 listed.append(
                     {
                         "frame": int(frame),
@@ -144,8 +146,8 @@ class Recording:
         factor = region.binning()
         hdf5.look_again(self._data)
         pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
-        if corrected and (found := self._references(frames)) is not None:
-            dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in found)
+        if corrected and (references := self._references(frames)) is not None:
+            dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in references)
             with np.errstate(divide="ignore", invalid="ignore"):
                 pixels = (pixels - dark) / (flat - dark)
         return pixels, region, factor

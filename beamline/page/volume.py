@@ -16,8 +16,9 @@ from scipy.ndimage import map_coordinates
 from beamline.core.errors import DataError
 from beamline.page.slices import F32, HELD, VolumeSlices, slices_of
 from beamline.page.tiles import TileRegion, bin_mean
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume, times_of
-from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from beamline.storage.writers.recon_file import opened_reconstruction
 
 BINS = 256
 _PERCENTILES = ((0.5, 99.8), (2, 98), (5, 95))

@@ -14,7 +14,7 @@ from drivers.plugins import plugins
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
-    from beamline.storage.writers.recon_file import Value
+    from beamline.storage.recon_record import Value
 
 REGISTRY: dict[str, str] = {
     "TiltAndLens": "resampling",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 if TYPE_CHECKING:
-    from beamline.storage.writers.recon_file import Value
+    from beamline.storage.recon_record import Value
 
 
 class NamedStep(Protocol):

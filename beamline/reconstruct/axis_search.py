@@ -48,13 +48,13 @@ class AxisSearch:
         last_chance = ended and self.col is None
         try:
             told = self._warn if last_chance else _quiet
-            found, estimate = locate_axis(self._source, correction, views, told, all_there=last_chance)
+            axis_col, estimate = locate_axis(self._source, correction, views, told, all_there=last_chance)
         except DataError:
             if last_chance:
                 raise
             return  # the views do not cover enough angles yet
         if estimate.confident or last_chance:
-            self.col, self.estimate = found, estimate
+            self.col, self.estimate = axis_col, estimate
 
 
 def _quiet(text: str) -> None:

@@ -184,15 +184,15 @@ class Worker:
             silent = time.monotonic() - self._heard > self._silence
         if not process.running:
             process.wait()  # for its last lines
-        said = last_line(self._log, before)
+        reason = last_line(self._log, before)
         if self._ended.is_set():
             code: int | None = self._code
         else:
             code = None if silent else process.code
-            said = f"it hung: no word from it for {self._silence:g} s" if silent else said
+            reason = f"it hung: no word from it for {self._silence:g} s" if silent else reason
         if code not in _WITH_VOLUME:
             self.end()
-        return code, said
+        return code, reason
 
     def _start(self) -> ChildProcess:
         stderr = self._running.enter_context(self._log.open("w", encoding="utf-8"))
@@ -223,15 +223,15 @@ def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) ->
     start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
     for tried, n in enumerate(waiting):
         spent = clock.now() - start
-        left = spent / tried * (len(waiting) - tried) if tried else None
+        seconds_left = spent / tried * (len(waiting) - tried) if tried else None
         rate = 60 * tried / max(spent, 1e-9)
-        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, left, rate, time=clock.now()))
+        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, seconds_left, rate, time=clock.now()))
         rows[n] = _one(rows[n], options, worker, sink, clock)
         _write(folder, rows)
         row = rows[n]
-        said = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+        sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
         now = clock.now()
-        sink(StateEntered("batch", said, time=now) if row.has_volume else Warned(said, "batch", time=now))
+        sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
     return rows
 
 
@@ -241,8 +241,14 @@ def names_of(scans: Sequence[Path]) -> list[str]:
     names = [own[-1] for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
         shared = _shared(names)
-        names = ["_".join(own[-depth:]) if one else name for own, name, one in zip(parts, names, shared, strict=True)]
-    return [f"{name}_{n}" if one else name for n, (name, one) in enumerate(zip(names, _shared(names), strict=True))]
+        names = [
+            "_".join(own[-depth:]) if is_shared else name
+            for own, name, is_shared in zip(parts, names, shared, strict=True)
+        ]
+    return [
+        f"{name}_{n}" if is_shared else name
+        for n, (name, is_shared) in enumerate(zip(names, _shared(names), strict=True))
+    ]
 
 
 def _shared(names: Sequence[str]) -> list[bool]:

@@ -91,7 +91,7 @@ class _Budget:
     largest_binning: int
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         return self.seconds - (self.now() - self.begin)
 
     def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
@@ -99,23 +99,22 @@ class _Budget:
 
         If no time is left: the cheapest without binned pixels, if its time is a small share of the time used.
         """
-        if self.left < _RESERVE * self.seconds:
+        if self.seconds_left < _RESERVE * self.seconds:
             full = plans(_LATE * (self.now() - self.begin), self.speeds, 1, self.methods)
             if math.isfinite(full[0].gain):
                 return [min(full, key=lambda choice: choice.seconds)]
         # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
-        left = max(share * self.left, sys.float_info.min)
-        return plans(left, self.speeds, self.largest_binning, self.methods if name is None else [name])
+        available = max(share * self.seconds_left, sys.float_info.min)
+        return plans(available, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
-    def preferred(self, found: Sequence[Choice]) -> Choice:
+    def preferred(self, choices: Sequence[Choice]) -> Choice:
         """The first of the methods that is level with the most promising one."""
-        level = [c for c in found if c.gain >= found[0].gain - _LEVEL]
+        level = [c for c in choices if c.gain >= choices[0].gain - _LEVEL]
         order = list(self.methods)
         return min(level, key=lambda c: order.index(c.method))
 
     def method(self, choice: Choice, default_count: int) -> Method:
-        found: Method = with_settings(self.methods[choice.method], choice.settings(default_count))
-        return found
+        return with_settings(self.methods[choice.method], choice.settings(default_count))
 
 
 def within(
@@ -153,18 +152,18 @@ def within(
     if any(method.traits.any_grid for method in modelled.values()) and is_wider(_problem_of(prepared, seed)):
         taking = modelled
     plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
-    spent = budget - plan.left
-    found = plan.choices()
-    choice, because = found[0], ""
+    spent = budget - plan.seconds_left
+    choices = plan.choices()
+    choice, because = choices[0], ""
     late = spent + choice.seconds - budget
-    over = late > 0 and plan.left < _RESERVE * budget
+    over = late > 0 and plan.seconds_left < _RESERVE * budget
     if late > 0 and math.isfinite(late) and (over or not math.isfinite(choice.gain)):
         warn(
             f"{duration_text(budget)} are too few for this scan: measuring this machine took {duration_text(spent)}, "
             f"and the cheapest choice, {_named(choice)}, will be about {duration_text(late)} late."
         )
-    if len(found) > 1:
-        choice, because = _chosen(plan, found, prepared, seed, control)
+    if len(choices) > 1:
+        choice, because = _chosen(plan, choices, prepared, seed, control)
     prepared = binned(prepared, choice.binning)
     method = plan.method(choice, unbinned)
     end = begin + budget * (1 - _RESERVE)
@@ -175,18 +174,18 @@ def within(
 
 
 def _chosen(
-    plan: _Budget, found: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
+    plan: _Budget, choices: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
 ) -> tuple[Choice, str]:
     """The method that predicts views of some rows best, with the settings that the rest of the time suffices for."""
-    listed = ", ".join(f"{c.method} {c.gain:.1f}" for c in found)
+    listed = ", ".join(f"{c.method} {c.gain:.1f}" for c in choices)
     expected = f"expected by other scans, dB above FBP: {listed}; nothing was tried: "
-    by_curves = plan.preferred(found)
+    by_curves = plan.preferred(choices)
     problem = _problem_of(prepared, seed)
     # Those that take no time first, then the most promising ones, since the time may end before the last.
     tried = sorted((c for c in plan.choices(1 - _TRIAL) if c.binning == 1), key=lambda c: bool(c.counted))
     if len(tried) < 2:
         return by_curves, f"{expected}too little time"
-    seconds = _TRIAL * plan.left
+    seconds = _TRIAL * plan.seconds_left
     for rows in _TRIAL_ROWS:
         part, where = part_of(problem, rows)
         if part is None:

@@ -25,8 +25,8 @@ from beamline.reconstruct.energy_views import Spectra
 from beamline.reconstruct.slabs import SHARE
 from beamline.report.figures import downwards, dpi_for, planes, png
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
 
 _SLAB = 16  # slices read at a time
@@ -54,12 +54,12 @@ class ChargeMap:
 
     def lines(self) -> list[str]:
         """Sentences for people."""
-        said = self.record.metrics
+        metrics = self.record.metrics
         return [
             f"map of      {self.names[-1]} in the sum of {', '.join(self.names)}",
-            f"voxels      {said['filled_share']:.1%} are filled to {self.least:g} or more",
-            f"mean        {said['mean']:.4f}, a tenth of them below {said['percentile_10']:.3f}, a tenth "
-            f"above {said['percentile_90']:.3f}",
+            f"voxels      {metrics['filled_share']:.1%} are filled to {self.least:g} or more",
+            f"mean        {metrics['mean']:.4f}, a tenth of them below {metrics['percentile_10']:.3f}, a tenth "
+            f"above {metrics['percentile_90']:.3f}",
         ]
 
 
@@ -93,19 +93,19 @@ def charge_map(
         names = tuple(own_names) if spectra is None else spectra.names
         grid = first.volume.grid
         _refuse_memory(grid)
-        found = np.empty(grid.shape, np.float32)
+        charge = np.empty(grid.shape, np.float32)
         for begin in range(0, grid.shape[0], _SLAB):
             part = np.stack([np.asarray(each.volume.data[begin : begin + _SLAB], np.float32) for each in records])
             if unmix is not None:
                 part = np.tensordot(unmix, part, 1).astype(np.float32)
-            found[begin : begin + _SLAB] = share_of_last(part, least)
+            charge[begin : begin + _SLAB] = share_of_last(part, least)
             counting(min(begin + _SLAB, grid.shape[0]), grid.shape[0])
-    filled = found[np.isfinite(found)]
+    filled = charge[np.isfinite(charge)]
     if not filled.size:
         raise DataError(f"No voxel is filled to {least:g} by {', '.join(names)}; give --least. Nothing was written.")
     low, high = np.percentile(filled, [10, 90])
     record = ReconRecord(
-        volume=Volume(found, grid),
+        volume=Volume(charge, grid),
         length_unit=first.length_unit,
         raw_file=first.raw_file,
         title=f"share of {names[-1]} (state of charge)",
@@ -117,7 +117,7 @@ def charge_map(
             "mean": float(filled.mean()),
             "percentile_10": float(low),
             "percentile_90": float(high),
-            "filled_share": filled.size / found.size,
+            "filled_share": filled.size / charge.size,
         },
     )
     return ChargeMap(record, names, energies, least)
@@ -185,11 +185,11 @@ def _refuse_memory(grid: Grid) -> None:
         )
 
 
-def picture(found: ChargeMap) -> bytes:
+def picture(charge: ChargeMap) -> bytes:
     """PNG: three orthogonal slices where most voxels are filled, from 0 to 1, and how many voxels have which charge."""
-    volume, unit = found.record.volume, found.record.length_unit
-    known = np.isfinite(volume.data)
-    at = [int(known.sum(axis=tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
+    volume, unit = charge.record.volume, charge.record.length_unit
+    filled = np.isfinite(volume.data)
+    at = [int(filled.sum(axis=tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
     images = (volume.data[at[0]], volume.data[:, at[1]], volume.data[:, :, at[2]])
     height = max(volume.grid.shape[1] / volume.grid.shape[2], volume.grid.shape[0] / volume.grid.shape[2], 0.3)
     figure = Figure(figsize=(11, 2.6 * height + 3.2), dpi=dpi_for(volume.grid.shape[2], 3.0), layout="constrained")
@@ -207,9 +207,9 @@ def picture(found: ChargeMap) -> bytes:
         axes.set_xlabel(f"{across} ({unit})", fontsize=8)
         axes.set_ylabel(downwards(down, unit), fontsize=8)
         axes.tick_params(labelsize=7)
-    upper.colorbar(shown, ax=list(panels), shrink=0.8).set_label(f"share of {found.names[-1]}")
+    upper.colorbar(shown, ax=list(panels), shrink=0.8).set_label(f"share of {charge.names[-1]}")
     counts = lower.subplots()
-    counts.hist(volume.data[known], bins=100, range=(0, 1), color="0.35")
-    counts.set(xlabel=f"share of {found.names[-1]} (state of charge)", ylabel="voxels", xlim=(0, 1))
+    counts.hist(volume.data[filled], bins=100, range=(0, 1), color="0.35")
+    counts.set(xlabel=f"share of {charge.names[-1]} (state of charge)", ylabel="voxels", xlim=(0, 1))
     counts.grid(alpha=0.3)
     return png(figure)

@@ -15,8 +15,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
+from beamline.storage.recon_record import Value
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from beamline.storage.writers.recon_file import Value
 from recon.base.geometry import arrays_of
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
@@ -47,16 +47,16 @@ def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[s
     """The differences between two origins (`made_from`), in words."""
     out = []
     for name in dict.fromkeys([*now, *before]):
-        one, other = now.get(name), before.get(name)
-        if one is None or other is None:
+        current, stored = now.get(name), before.get(name)
+        if current is None or stored is None:
             out.append(f"{name} is known of one of them only")
-        elif not np.array_equal(np.asarray(one), np.asarray(other)):
-            out.append(f"{name.removeprefix('setting ')} {_told(one, other)}")
+        elif not np.array_equal(np.asarray(current), np.asarray(stored)):
+            out.append(f"{name.removeprefix('setting ')} {_told(current, stored)}")
     return out
 
 
-def _told(one: Value, other: Value) -> str:
-    a, b = np.asarray(one), np.asarray(other)
+def _told(current: Value, stored: Value) -> str:
+    a, b = np.asarray(current), np.asarray(stored)
     if a.shape != b.shape:
         return f"({a.size} values, {b.size} in the file)"
     if a.size > 3:

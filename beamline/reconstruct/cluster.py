@@ -72,13 +72,13 @@ class Cluster:
         future = self._client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
         try:
             self._wait_for(future)
-            found: Reconstruction = future.result()
+            made: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
             raise WorkersLostError(
                 f"The scheduler, or several workers with the same slab, were lost ({error}). They may lack memory: "
                 "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
             ) from error
-        return found
+        return made
 
     def _wait_for(self, future: Future) -> None:
         """Return when it is done; raises WorkersLostError after `patience` without a worker."""
@@ -108,8 +108,8 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
     data, geometry, method, settings, decide = work
     assert decide is None or isinstance(decide, Decisions)
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    found = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
-    return replace(found, gaussians=None, checkpoint=None, settings=dict(found.settings))
+    made = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
+    return replace(made, gaussians=None, checkpoint=None, settings=dict(made.settings))
 
 
 def check_cluster(spec: str) -> None:

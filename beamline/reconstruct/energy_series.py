@@ -20,8 +20,8 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.energy_views import Spectra, energy_views
 from beamline.reconstruct.progress import sweeps_told
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import write_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
 from recon.base.volume import Grid, Volume
 from recon.energy_fit import EnergyViews
@@ -136,9 +136,9 @@ def _with_share(
     """`fit_share`, and whether it was stopped."""
     early = False
 
-    def go_on(left: int) -> bool:
+    def go_on(steps_left: int) -> bool:
         nonlocal early
-        told(SHARE_STEPS - left, SHARE_STEPS)
+        told(SHARE_STEPS - steps_left, SHARE_STEPS)
         early = stopping()
         return not early
 

@@ -92,8 +92,8 @@ def read_spectra(path: Path) -> Spectra:
         try:
             values[number] = [float(cell) for _, cell in zip(head, line, strict=True)]
         except ValueError:
-            said = ",".join(line)[:80]
-            raise DataError(f"{path}: {said!r} are not {len(head)} numbers. Expected {_TABLE}.") from None
+            text = ",".join(line)[:80]
+            raise DataError(f"{path}: {text!r} are not {len(head)} numbers. Expected {_TABLE}.") from None
     values = values[np.argsort(values[:, 0])]
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
         raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")

@@ -57,7 +57,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
 
 def made_by(method: Method, name: str) -> Method:
     """The method itself, or the candidate of this name, if it chose one."""
-    return {one.name: one for one in candidates_of(method)}.get(name, method)
+    return {candidate.name: candidate for candidate in candidates_of(method)}.get(name, method)
 
 
 def deviation_of(
@@ -69,10 +69,10 @@ def deviation_of(
     Raises:
         ValueError: as `recon.error_bars.error_bars`.
     """
-    found = _bars(method, prepared, options, volume, decided, control)
+    bars = _bars(method, prepared, options, volume, decided, control)
     if control.should_stop is not None and control.should_stop():  # a direct method does not ask
         return None
-    return None if found is None else Volume(found.deviation, volume.grid)
+    return None if bars is None else Volume(bars.deviation, volume.grid)
 
 
 def deviation_by_slabs(
@@ -99,11 +99,11 @@ def deviation_by_slabs(
         if not part.projections.data.any():
             continue
         here = Volume(np.ascontiguousarray(volume.data[slab.slices]), box)
-        found = _bars(method, part, options, here, decided, control)
-        if found is None or (control.should_stop is not None and control.should_stop()):
+        bars = _bars(method, part, options, here, decided, control)
+        if bars is None or (control.should_stop is not None and control.should_stop()):
             return None
-        decided = found.decided
-        for z, share, values in zip(range(*slab.slices.indices(len(out))), slab.share, found.deviation, strict=True):
+        decided = bars.decided
+        for z, share, values in zip(range(*slab.slices.indices(len(out))), slab.share, bars.deviation, strict=True):
             if share > 0:
                 out[z] += share * values
         say(f"Error bars of slab {done} of {len(parts)}.")

@@ -82,7 +82,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         geometry = stated_geometry(source, options.selection)
         allowed, needs = memory_of(options), needs_of(source, options)
         shape = Grid.matching(geometry).shape
-        slabs = left = slabs_of(shape[0], shape[0], 0)
+        slabs = missing = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
         if not fits and geometry.is_cone:
             raise DataError(
@@ -93,9 +93,9 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             refuse_whole(source, options, needs, allowed)
             needs = replace(needs, weighted=surely_weighted(source, options))
             refuse_smallest(source, needs, allowed, options.selection.binning)
-            slabs = left = slabs_of(shape[0], needs.height(allowed), needs.method.traits.halo)
+            slabs = missing = slabs_of(shape[0], needs.height(allowed), needs.method.traits.halo)
         if options.partial is not None:
-            slabs, left = slabs_of_partial(options.partial)
+            slabs, missing = slabs_of_partial(options.partial)
             if slabs[-1].own.stop != shape[0]:
                 raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {shape[0]}.")
             refuse_slabs(options.partial, slabs, needs, allowed)
@@ -107,17 +107,17 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             f"{options.target.output.parent} has {size(free)}, and {size(scratch + output)} are needed. Write "
             f"with -o to another disk, or give --bin {2 * options.selection.binning}."
         )
-    heights = [slab.slices.stop - slab.slices.start for slab in left]
+    heights = [slab.slices.stop - slab.slices.start for slab in missing]
     extent = Extent(geometry, heights, decided=options.partial is not None)
     try:
-        seconds = run_seconds(needs.method, extent, clock.now) if left else RunTime(0.0, 0.0)
+        seconds = run_seconds(needs.method, extent, clock.now) if missing else RunTime(0.0, 0.0)
     except ValueError as error:  # as the method itself refuses the views
         raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
     most, least = (each * (1 + options.uncertainty) for each in seconds)  # error bars take at most as long
-    done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
+    done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
     height = slabs[0].own.stop
     return Estimate(
         options.method.name, geometry.n_views, shape, needs.at_once, allowed,
-        needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, output, free,
+        needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
         most, least,
     )  # fmt: skip

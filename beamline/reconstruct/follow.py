@@ -81,24 +81,24 @@ def follow(
     warn = Warnings(sink, clock)
     _compile(options, sink, clock, rhythm)
     with _open(options, sink, clock, rhythm) as source:
-        growing = ScanFollower(options, source, sink, clock, warn)
+        follower = ScanFollower(options, source, sink, clock, warn)
         with stop_scope() as should_stop:
-            if _watch(growing, clock, rhythm, should_stop):
-                growing.catch_up(should_stop)
+            if _watch(follower, clock, rhythm, should_stop):
+                follower.catch_up(should_stop)
             else:
-                n = growing.n_views_taken
+                n = follower.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
-            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, should_stop)
+            made, prepared = follower.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, should_stop)
     # Opened again: HDF5 may still have the texts of the end as they were when it first read them.
     with _open(options, sink, clock, rhythm) as source:
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = ReportContext(
         facts, options.selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
-        live_picture=options.target.live_picture.name if growing.snapshots.drawn else "", filter=options.filter,
+        live_picture=options.target.live_picture.name if follower.snapshots.drawn else "", filter=options.filter,
     )  # fmt: skip
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
-    growing.snapshots.remove()
+    follower.snapshots.remove()
     return metrics
 
 
@@ -134,31 +134,31 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming)
             clock.sleep(rhythm.poll)
 
 
-def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_stop: Callable[[], bool]) -> bool:
+def _watch(follower: ScanFollower, clock: Clock, rhythm: FollowTiming, should_stop: Callable[[], bool]) -> bool:
     """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
 
     Raises:
         DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
     """
     last_snapshot = clock.now()
-    writer = WriterWatch(growing.source.path, last_snapshot, rhythm.patience)
+    writer = WriterWatch(follower.source.path, last_snapshot, rhythm.patience)
     while True:
-        ended = growing.source.finished  # asked before the frames, so that none is missed
-        grew = growing.take_new_frames(ended)
+        ended = follower.source.finished  # asked before the frames, so that none is missed
+        grew = follower.take_new_frames(ended)
         if ended:
             return True
-        if should_stop() and not growing.source.finished:
-            if not growing.has_volume:
+        if should_stop() and not follower.source.finished:
+            if not follower.has_volume:
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False
-        if why := writer.lost(clock.now(), grew, lambda: growing.source.finished):
+        if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
-                f"{growing.source.path} {why} and is not finished. {next_step(growing.source.path)} Without --follow "
-                f"and with --unfinished the {growing.n_views} views that are there are used."
+                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
+                f"and with --unfinished the {follower.n_views} views that are there are used."
             )
-        if not growing.advance(rhythm.slice):
+        if not follower.advance(rhythm.slice):
             clock.sleep(rhythm.poll)
         elif clock.now() - last_snapshot >= rhythm.snapshot:
-            growing.write_snapshot()
+            follower.write_snapshot()
             last_snapshot = clock.now()
-        growing.ask_whether_enough()
+        follower.ask_whether_enough()

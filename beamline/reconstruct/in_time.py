@@ -71,22 +71,22 @@ def fit_within(
     pages = target.report is not None
     after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
     measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
-    left, least = method.seconds - spent - measuring - after, _LEAST * sweep
-    if left < least:
-        said = (
+    remaining, least = method.seconds - spent - measuring - after, _LEAST * sweep
+    if remaining < least:
+        sentence = (
             f"{duration_text(method.seconds)} do not suffice for this scan: reading and correcting it took "
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "
             f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method"
         )
         if (kind := getattr(method, "start", None)) is not None:
             start = sweeps_of_start(geometry, kind) * sweep
-            said += (
+            sentence += (
                 f". The start of a fit of all pixels takes {duration_text(start)}. With a start from coarse pixels the "
                 f"end is in about {duration_text(least + measuring + after)}"
             )
-        warn(f"{said}.")
+        warn(f"{sentence}.")
     deadline = Deadline(started[0] + method.seconds, after, clock.now)
-    return with_settings(method, {"seconds": max(left, 0.0)}), deadline
+    return with_settings(method, {"seconds": max(remaining, 0.0)}), deadline
 
 
 @contextmanager

@@ -302,7 +302,7 @@ class ScanFollower:
     def finish(
         self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
     ) -> tuple[Reconstruction, PreparedProjections]:
-        """The last round over all views in `seconds` or until `stopped`, with snapshots.
+        """The last round over all views in `seconds` or until `should_stop`, with snapshots.
 
         Returns the volume, and the line integrals that it grew from, to judge it by.
 
@@ -353,9 +353,9 @@ class ScanFollower:
             "gaussians": self._history[-1].n_gaussians,
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
-        method, seconds = self._options.method.name, self._clock.now() - self._begin
+        method, elapsed = self._options.method.name, self._clock.now() - self._begin
         history = tuple(self._history)
-        return Reconstruction(volume, settings, history, gaussians, method=method, seconds=seconds), prepared
+        return Reconstruction(volume, settings, history, gaussians, method=method, seconds=elapsed), prepared
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""

@@ -54,10 +54,10 @@ def _volume_in(path: Path) -> str | None:
     if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with hdf5.open_hdf5(path) as file:
-        found = next((p for p in _VOLUME_PATHS if getattr(file.get(p), "ndim", 0) == 3), None)
-    if found is None:
+        dataset = next((p for p in _VOLUME_PATHS if getattr(file.get(p), "ndim", 0) == 3), None)
+    if dataset is None:
         raise DataError(f"expected a 3-D dataset at one of {', '.join(_VOLUME_PATHS)}")
-    return found
+    return dataset
 
 
 def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
@@ -206,7 +206,7 @@ def _residual(
     progress: Callable[[int, int], None],
 ) -> float:
     """The residual of the volume in these views, without unmeasured rays."""
-    left = total = 0.0
+    squared = total = 0.0
     some = geometry.select(views)
     matter = np.maximum(sum(data[view].sum(axis=1, dtype=np.float64) for view in views), 0)
     bands = residual_bands(volume.grid, some, matter)
@@ -217,13 +217,13 @@ def _residual(
             height = (part.middle_height, *volume.grid.centre[1:])
             grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
             lines = Volume(np.ascontiguousarray(volume.data[rows]), grid)
-        known = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
-        found, scale = residual_norms(lines, data[views, rows], part, known)
-        left, total = left + found**2, total + scale**2
+        measured = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
+        residual, scale = residual_norms(lines, data[views, rows], part, measured)
+        squared, total = squared + residual**2, total + scale**2
         progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
         raise ValueError("projections are all zero, so there is nothing to explain")
-    return float(np.sqrt(left / total))
+    return float(np.sqrt(squared / total))
 
 
 def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) -> list[slice]:

@@ -15,9 +15,10 @@ from beamline.core.files import whole_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.ingest import PER_FLUSH, complete
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import ScanEnding
-from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from beamline.storage.writers.recon_file import opened_reconstruction
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -68,22 +69,22 @@ def read_model(path: Path) -> Model:
         DataError: the file holds none, or cannot be read.
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
-        found = record.model
-        if not found:
+        arrays = record.model
+        if not arrays:
             raise DataError(
                 f"{path} holds no Gaussians: {record.parameters.get('method', 'its method')} has none, or the volume "
                 "was made in slabs. Expected a volume of r2 made at once. Nothing was written."
             )
-        rows, cols = (int(n) for n in found["detector_shape"])
-        sod, sdd = (float(d) for d in found["source_distances"])
-        axis_col, axis_row = (float(a) for a in found["axis"])
+        rows, cols = (int(n) for n in arrays["detector_shape"])
+        sod, sdd = (float(d) for d in arrays["source_distances"])
+        axis_col, axis_row = (float(a) for a in arrays["axis"])
         geometry = Geometry(
-            found["view_angles"], (rows, cols), float(found["pixel_pitch"]), axis_col, axis_row, sod, sdd,
-            found["view_shifts"], found["view_roll"], found["view_tilt"],
+            arrays["view_angles"], (rows, cols), float(arrays["pixel_pitch"]), axis_col, axis_row, sod, sdd,
+            arrays["view_shifts"], arrays["view_roll"], arrays["view_tilt"],
         )  # fmt: skip
         gaussians = Gaussians.from_physical(
-            found["centres"], found["widths"], found["densities"], found["rotations"], float(found["density_unit"]),
-            Kernel(str(found["kernel"])),
+            arrays["centres"], arrays["widths"], arrays["densities"], arrays["rotations"],
+            float(arrays["density_unit"]), Kernel(str(arrays["kernel"])),
         )  # fmt: skip
         # Error bars and FBP are of the file's voxels, and the file is closed behind this.
         return Model(gaussians, geometry, replace(record, deviation=None, fbp=None))
@@ -125,8 +126,8 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
     Raises:
         DataError: a cone that a scan file cannot state, `path` exists, or the disk refuses; nothing is left.
     """
-    one, in_mm = model.geometry.select([0]), model.record.length_unit == "mm"
-    geometry = replace(one, shifts=np.zeros((1, 2)), roll=np.zeros(1), tilt=np.zeros(1)).at(angles)
+    first_view, in_mm = model.geometry.select([0]), model.record.length_unit == "mm"
+    geometry = replace(first_view, shifts=np.zeros((1, 2)), roll=np.zeros(1), tilt=np.zeros(1)).at(angles)
     middle = (geometry.detector_shape[0] - 1) / 2
     if geometry.is_cone and not (in_mm and abs(geometry.axis_row - middle) < 1e-3):
         raise DataError(
@@ -163,9 +164,9 @@ def write_ply(path: Path, model: Model) -> None:
     Raises:
         DataError: `path` exists, or the disk refuses; nothing is left.
     """
-    found, unit = model.gaussians.physical(), model.record.length_unit
+    arrays, unit = model.gaussians.physical(), model.record.length_unit
     names = ("x", "y", "z", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "density")
-    columns = (found["centres"], found["widths"], found["rotations"], found["densities"][:, None])
+    columns = (arrays["centres"], arrays["widths"], arrays["rotations"], arrays["densities"][:, None])
     rows = np.concatenate(columns, axis=1).astype("<f4")
     head = [
         "ply",

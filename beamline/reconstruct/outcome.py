@@ -60,6 +60,7 @@ class ReportContext:
     """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
 
     Attributes:
+        scan_flags: sentences of the monitor during the scan, where the reconstruction belongs to its run.
         filter: of FBP, also of the one that the volume is compared with.
         chosen: what a budget, a preset or the data chose, in a line; empty where the settings were given.
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.

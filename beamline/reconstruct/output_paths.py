@@ -13,8 +13,8 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
-from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid
 
 _ROOM = 3.0  # times a volume: free disk from which on a second one is kept

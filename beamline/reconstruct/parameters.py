@@ -12,7 +12,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.outcome import ReportContext
 from beamline.reconstruct.remarks import partly_seen
-from beamline.storage.writers.recon_file import Value
+from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
 from recon.prep.align import AxisEstimate
 

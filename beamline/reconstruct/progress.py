@@ -23,12 +23,12 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
         step = progress.step
         made, spent = progress.step - first.step, progress.seconds - first.seconds
         rate = made / spent if made > 0 and spent > 0 else None
-        left = None
+        seconds_left = None
         if progress.steps and rate:
-            left = (progress.steps - progress.step) / rate
+            seconds_left = (progress.steps - progress.step) / rate
         elif seconds is not None and not progress.steps and not progress.unit:
-            left = max(0.0, seconds - spent)
-        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=left, time=clock.now()))
+            seconds_left = max(0.0, seconds - spent)
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=seconds_left, time=clock.now()))
 
     return on_progress
 

@@ -16,7 +16,7 @@ from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, price_of_decibel, price_text, residual_curve, views_grew
 from beamline.report.time_curves import quality_against_time
-from beamline.storage.writers.recon_file import Value
+from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
@@ -279,11 +279,11 @@ def _pictures(
 
 def _of_wedges(unseen: Sequence[Wedge]) -> str:
     """Size and direction of the wedges, and what they do to the volume."""
-    said = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
+    directions = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
     size = math.degrees(sum(wedge.size for wedge in unseen))
     return (
-        f"{size:.0f}° of rays are in no view, those at {said} from x towards y (orange): edges along them are blurred, "
-        "and small things are drawn out across them."
+        f"{size:.0f}° of rays are in no view, those at {directions} from x towards y (orange): edges along them are "
+        "blurred, and small things are drawn out across them."
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from beamline.reconstruct.outcome import ReportContext
 from beamline.report.html import Picture, Report
 from beamline.report.slice_sheet import SliceSheet
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.recon_record import ReconRecord
 
 FACTORS = "factors of their mean, smooth within matter"
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts are drawn, too

@@ -21,8 +21,8 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import for_part
+from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
-from beamline.storage.writers.recon_file import ReconRecord, Value
 from recon.base.decisions import Decisions
 from recon.base.method import Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of
@@ -81,38 +81,40 @@ def in_slabs(
     def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
         """The slab, and a sentence on it; None for views that are zero."""
         slab, follows = slabs[n], partial is not None
-        one = replace(control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0]))
+        control_of_slab = replace(
+            control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0])
+        )
         rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
         part = prepared.of_rows(rows, geometry)
         if not part.projections.data.any():
             return None, ""
         try:
             method = for_part(options.method, slab.slices.stop - slab.slices.start, grid.shape[0], in_all)
-            return by(method, part, box, one), ""
+            return by(method, part, box, control_of_slab), ""
         except DataError as error:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
             if not follows or not options.method.traits.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
-            return by(FistaTv(), part, box, one), remark
+            return by(FistaTv(), part, box, control_of_slab), remark
 
     def progress(n: int) -> None:
         say(f"Slab {n + 1} of {len(slabs)}: slices {slabs[n].own.start} to {slabs[n].own.stop - 1}.")
 
-    left = [n for n in busiest_first(prepared, grid, slabs) if partial is None or not partial.has(n)]
+    missing = [n for n in busiest_first(prepared, grid, slabs) if partial is None or not partial.has(n)]
     while partial is None:
-        if not left:
+        if not missing:
             raise DataError("The views are zero everywhere: there is nothing in the beam.")
-        progress(n := left.pop(0))
+        progress(n := missing.pop(0))
         decide = Decisions(options.seed)
-        if (found := made(n, run, decide, 0)[0]) is not None:
+        if (first_slab := made(n, run, decide, 0)[0]) is not None:
             record = _record(prepared, options, grid, begin)
-            partial = create_partial(options.partial_path, record, slabs, made_from, _kept(found, decide))
-            partial.add(n, found.volume.data)
-        del found  # no slab is in memory while the next one is made
+            partial = create_partial(options.partial_path, record, slabs, made_from, _kept(first_slab, decide))
+            partial.add(n, first_slab.volume.data)
+        del first_slab  # no slab is in memory while the next one is made
     decided = partial.kept["decided"]
     if workers is None:
-        for n in left:
+        for n in missing:
             progress(n)
             _add(partial, n, *made(n, run, Decisions(options.seed, decided), partial.n_slices_done), warn)
     else:
@@ -120,8 +122,8 @@ def in_slabs(
         def by_worker(n: int) -> tuple[Reconstruction | None, str]:
             return made(n, workers.run, Decisions(options.seed, decided), 0)
 
-        for n, (found, remark) in _as_they_come(by_worker, left, workers.count):
-            _add(partial, n, found, remark, warn)
+        for n, (result, remark) in _as_they_come(by_worker, missing, workers.count):
+            _add(partial, n, result, remark, warn)
             say(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
             if (listen := control.on_progress) is not None:
                 seconds, views = control.now() - begin, prepared.geometry.n_views
@@ -131,9 +133,9 @@ def in_slabs(
     return _whole(partial, grid, options, control.now() - begin)
 
 
-def _as_they_come(make: Callable[[int], T], left: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:
-    """The slabs `left` and what `make` returns of each; so many at a time are made or wait to be taken."""
-    pool, ahead, under_way = ThreadPoolExecutor(at_a_time), list(left), dict[Future[T], int]()
+def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:
+    """The slabs of these numbers and what `make` returns of each; `at_a_time` are made or wait to be taken."""
+    pool, ahead, under_way = ThreadPoolExecutor(at_a_time), list(numbers), dict[Future[T], int]()
     try:
         while ahead or under_way:
             while ahead and len(under_way) < at_a_time:
@@ -147,8 +149,8 @@ def _as_they_come(make: Callable[[int], T], left: Sequence[int], at_a_time: int)
         pool.shutdown(wait=not under_way, cancel_futures=True)
 
 
-def _add(partial: PartialVolume, n: int, found: Reconstruction | None, remark: str, warn: Warn) -> None:
-    partial.add(n, None if found is None else found.volume.data)
+def _add(partial: PartialVolume, n: int, made: Reconstruction | None, remark: str, warn: Warn) -> None:
+    partial.add(n, None if made is None else made.volume.data)
     if remark:
         warn(remark)
 

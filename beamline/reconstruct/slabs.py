@@ -123,7 +123,7 @@ class Needs:
         work = method.memory(geometry, grid, self.weighted)
         if not self.bars:
             return work
-        bars = max(error_bars_memory(one, geometry, grid) for one in candidates_of(method))
+        bars = max(error_bars_memory(candidate, geometry, grid) for candidate in candidates_of(method))
         return max(work, 4 * math.prod(grid.shape) + bars)
 
     @property
@@ -131,8 +131,8 @@ class Needs:
         """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
         looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
-        found = max(odd, _REGION * min(self.volume // 4, _REGIONS), *looks)
-        return found if found > _ASIDE else 0
+        most = max(odd, _REGION * min(self.volume // 4, _REGIONS), *looks)
+        return most if most > _ASIDE else 0
 
     @property
     def least(self) -> int:

@@ -20,7 +20,8 @@ from beamline.core.sinks import Warnings
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from beamline.storage.recon_record import ReconRecord
+from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
 from recon.base.noise import noise_level

@@ -10,8 +10,8 @@ import numpy as np
 
 from beamline.core.machine import free_memory
 from beamline.reconstruct.model import Model, read_model
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.arrays import F32
 from recon.post.surface import BySlices, Mesh, half_way, surface
 from recon.splatting.splat import voxelize

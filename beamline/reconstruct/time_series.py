@@ -28,8 +28,9 @@ from beamline.reconstruct.series_report import FACTORS, series_page
 from beamline.reconstruct.slabs import memory_of
 from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.recon_record import ReconRecord, VolumesInTime
 from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, VolumesInTime, write_reconstruction
+from beamline.storage.writers.recon_file import SUFFIXES, write_reconstruction
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.arrays import F32, F64, I64
@@ -307,17 +308,17 @@ def reconstruct_series(
 
 def _chosen(still: float, moved: float, moves: bool) -> str:
     """How views held out chose whether matter moves, and what to try where they can hardly tell."""
-    said = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
+    judged = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
     if moves or moved >= still:
-        return said
-    return f"{said}, which is less, but too little to be sure: if the sample moved, compare with --moves"
+        return judged
+    return f"{judged}, which is less, but too little to be sure: if the sample moved, compare with --moves"
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
     """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
-    known = source.times
-    if known is not None and np.isfinite(known[view_ids]).all():
-        return np.asarray(known[view_ids], np.float64)
+    seconds = source.times
+    if seconds is not None and np.isfinite(seconds[view_ids]).all():
+        return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
     warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
     return np.asarray(view_ids * float(period), np.float64)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beamline.core.files import write_whole
-from beamline.monitor.view import PixelBox
+from beamline.core.flag import PixelBox
 
 if TYPE_CHECKING:
     from simulators.effects.anomaly import Label

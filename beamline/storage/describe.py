@@ -13,10 +13,11 @@ import numpy as np
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import BriefSource
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules.validate import altered_said, source_findings
 from beamline.storage.volumes.files import times_of, volume_format
 from beamline.storage.writer_lock import held
-from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 
 LOOK = 15.0

@@ -16,7 +16,6 @@ from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
 from recon.methods import names
 
-_SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _APART = 16.0  # pixels between two numbers on the same side of their points, at least
 _MARKERS = {
@@ -43,7 +42,7 @@ def pareto_plot(
         unit: of the cost.
         pick: number in `front` of the trial that is worth its cost, which gets a ring; None: of none.
     """
-    figure = Figure(figsize=(_SIZE[0], _SIZE[1] + 0.18 * len(front)), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH, 5.2 + 0.18 * len(front)), dpi=DPI, layout="constrained")
     axes: Axes = figure.subplots()
     shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
     named = {id(points[i]) for i in front}
@@ -91,7 +90,7 @@ def pareto_plot(
 
 def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
     """The residual of each trial during its run, dB against s: solid for views held out, dashed for views used."""
-    figure = Figure(figsize=(_SIZE[0], 4.0), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH, 4.0), dpi=DPI, layout="constrained")
     axes: Axes = figure.subplots()
     for outcome in outcomes:
         seconds, quality = np.array(outcome.curve).T

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
-from beamline.monitor.view import PixelBox
+from beamline.core.flag import PixelBox
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import ContrastRegions, XafsCurve

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
-    from beamline.storage.writers.recon_file import Value
+    from beamline.storage.recon_record import Value
     from recon.base.geometry import Geometry
 
 _MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.flag import PixelBox
 from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
-from beamline.monitor.view import PixelBox
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
 from recon.base.arrays import Mask
 

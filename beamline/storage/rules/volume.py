@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules.finding import Finding
-from beamline.storage.writers.recon_file import ReconRecord
 
 
 def volume_findings(record: ReconRecord) -> Iterator[Finding]:

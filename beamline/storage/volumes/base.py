@@ -19,7 +19,7 @@ from beamline.core.errors import DataError
 from beamline.core.shipped import version
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage.readers.tiff import VOLUME
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.recon_record import ReconRecord
 from recon.base.volume import Grid, Volume
 
 

@@ -17,12 +17,13 @@ from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
 from beamline.storage.volumes.nxtomoproc import NexusVolume, NXtomoproc
 from beamline.storage.volumes.plain import Npy
 from beamline.storage.volumes.registry import formats
-from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction, volumes_in_time
+from beamline.storage.writers.recon_file import opened_reconstruction, volumes_in_time
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 

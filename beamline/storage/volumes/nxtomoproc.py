@@ -12,10 +12,11 @@ import h5py
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volume_file import axes_of
 from beamline.storage.volumes.base import Slices, bare_record
 from beamline.storage.volumes.registry import REGISTRY
-from beamline.storage.writers.recon_file import DEFINITION, ReconRecord, opened_reconstruction, write_record
+from beamline.storage.writers.recon_file import DEFINITION, opened_reconstruction, write_record
 from recon.base.volume import Volume
 
 

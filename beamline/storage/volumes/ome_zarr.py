@@ -24,9 +24,9 @@ from beamline.core.files import SETTINGS, bytes_below, open_below
 from beamline.storage.foreign_zarr import is_halved
 from beamline.storage.header import dtype_of, require_held, shape_of
 from beamline.storage.readers.tiff import VOLUME
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
-from beamline.storage.writers.recon_file import ReconRecord
 
 _CHUNK = 16, 256, 256  # voxels
 _SMALLEST = 256  # voxels along a side, below which no further scale is made

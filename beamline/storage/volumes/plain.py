@@ -13,9 +13,9 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.storage.header import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.readers.tiff import VOLUME
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
-from beamline.storage.writers.recon_file import ReconRecord
 
 _TYPES = {32: "float", 16: "uint16", 8: "uint8"}
 _LONGEST_HEADER = 2**20

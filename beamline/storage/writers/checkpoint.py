@@ -15,9 +15,10 @@ from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.shipped import version
 from beamline.storage import hdf5
+from beamline.storage.recon_record import Value
 from beamline.storage.structure import require_harmless
 from beamline.storage.writer_lock import opened_whole
-from beamline.storage.writers.recon_file import Value, value_of
+from beamline.storage.writers.recon_file import value_of
 
 _FORMAT = "splatline checkpoint 1"
 

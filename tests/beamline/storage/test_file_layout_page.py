@@ -21,8 +21,9 @@ from beamline.simulate.labels import LabelledRun, write_labels
 from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
+from beamline.storage.recon_record import VolumesInTime
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.recon_file import VolumesInTime, read_reconstruction, write_reconstruction
+from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
 from recon.base.volume import Grid
