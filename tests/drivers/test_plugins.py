@@ -70,7 +70,7 @@ class _SilentError(Exception):
         (_SilentError(SystemExit(0)), r"_SilentError: it does not say why \(SystemExit\)"),
         (ValueError("x" * 10**6), r"^.{1,1200}$"),
     ],
-    ids=["base", "control", "exit", "silent", "long"],
+    ids=["base", "control", "exit", "silent", "exits in its text", "long"],
 )
 def test_a_plug_in_neither_ends_a_command_nor_writes_to_its_output(
     announced: list[EntryPoint], capsys: pytest.CaptureFixture[str], error: BaseException, said: str
