@@ -56,7 +56,7 @@ def plugins(
 def _said(error: BaseException) -> str:
     try:
         return str(error)
-    except Exception as again:
+    except BaseException as again:  # from the text of another package's error, too
         return f"it does not say why ({type(again).__name__})"
 
 

@@ -205,7 +205,7 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
 
     Only --checkpoint may replace the file of --resume.
     """
-    named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
+    named = {option: os.path.normcase(os.path.realpath(path)) for option, path in files.items() if path is not None}
     for first, second in itertools.combinations(named, 2):
         if named[first] == named[second] and {first, second} != {"--checkpoint", "--resume"}:
             raise click.UsageError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import subprocess
@@ -92,7 +93,7 @@ def repeating(ctx: click.Context, argument: Path | Sequence[Path], output: Path,
     """
     again = f"{output.stem}_again{output.suffix}"
     files = [argument] if isinstance(argument, Path) else argument
-    words = ["beamline", str(ctx.info_name), *_leading(ctx), *(str(file.resolve()) for file in files)]
+    words = ["beamline", str(ctx.info_name), *_leading(ctx), *(os.path.realpath(file) for file in files)]
     for option, value in given(ctx).items():
         if option.name in ("output", *without) or not getattr(option, "repeated", True):
             continue
@@ -116,7 +117,7 @@ def _leading(ctx: click.Context) -> list[str]:
 def _from_anywhere(value: str, kind: object) -> str:
     """A path made absolute, also in FILE:first:end."""
     if isinstance(kind, click.Path):
-        return str(Path(value).resolve())
+        return os.path.realpath(value)  # `resolve` fails at links that go round
     head, colon, tail = value.partition(":")
     return f"{Path(head).resolve()}{colon}{tail}" if "." in head and Path(head).is_file() else value
 

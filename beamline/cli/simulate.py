@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from dataclasses import asdict, replace
@@ -150,11 +151,11 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
     from beamline.simulate.labels import labels_path
 
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
-    seen: dict[Path, str] = {}
+    seen: dict[str, str] = {}
     for what, path in named.items():
         if path is None:
             continue
-        other = seen.setdefault(path.resolve(), what)
+        other = seen.setdefault(os.path.realpath(path), what)
         if other is not what:
             raise ConfigError(f"{path} would be both {other} and {what}; name another. Nothing was simulated.")
         refuse_existing(path)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,14 +265,24 @@ def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
 def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
     """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
     for row in range(first, source.image_key.size):
-        pixels: NDArray[np.uint16] = read_known(source, [row])[0]
+        pixels: NDArray[Any] = read_known(source, [row])[0]
         if source.quantity == "line_integrals":
             with np.errstate(over="ignore"):
                 pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
             pixels = pixels.round().astype(np.uint16)
+        elif (kernel := _type_of_kernels(pixels.dtype)) != pixels.dtype:
+            pixels = pixels.astype(kernel)
         kind, angle = FrameKind(int(source.image_key[row])), float(source.angles[row])
         kind = FrameKind.INVALID if row in source.unreadable else kind
         yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.exposures[row]))
+
+
+def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type that holds such pixels for compiled kernels, which know neither foreign orders of bytes nor floats of 16
+    or more than 64 bits."""
+    if dtype.kind == "f" and dtype.itemsize not in (4, 8):
+        return np.dtype(np.float32 if dtype.itemsize == 2 else np.float64)
+    return dtype.newbyteorder("=")
 
 
 def _excess(flag: Flag) -> float:

@@ -74,10 +74,10 @@ def ingest(
     with whole_file(out) as partial, open_scan(scan) as source:
         ending = _ending_of(source)
         views = source.image_key == FrameKind.PROJECTION
-        if not np.isfinite(source.angles[views]).all():
+        if unknown := np.count_nonzero(~np.isfinite(source.angles[views])):
             raise DataError(
-                f"{source.path} does not say the angles of its {views.sum()} projections: give --angles FILE "
-                "(degrees, one a line). Nothing was written."
+                f"{source.path} does not say the angles of {unknown} of its {views.sum()} projections: give "
+                "--angles FILE (degrees, one a line). Nothing was written."
             )
         if source.shifts is not None:
             raise DataError(

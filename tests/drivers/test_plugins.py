@@ -57,7 +57,7 @@ def test_what_does_not_load_or_fit_or_has_a_name_that_is_taken_is_left_out_with_
 
 class _SilentError(Exception):
     def __str__(self) -> str:
-        raise ValueError
+        raise self.args[0]
 
 
 @pytest.mark.parametrize(
@@ -66,10 +66,11 @@ class _SilentError(Exception):
         (BaseException("a\x1b[2Jb\nbeamline: all is well"), r"BaseException: a\\x1b\[2Jb beamline: all is well\. Mend"),
         (GeneratorExit("\x9b\r\u202e"), r"GeneratorExit: \\x9b \\u202e\."),
         (SystemExit(0), r"SystemExit: 0\."),
-        (_SilentError(), r"_SilentError: it does not say why \(ValueError\)"),
+        (_SilentError(ValueError), r"_SilentError: it does not say why \(ValueError\)"),
+        (_SilentError(SystemExit(0)), r"_SilentError: it does not say why \(SystemExit\)"),
         (ValueError("x" * 10**6), r"^.{1,1200}$"),
     ],
-    ids=["base", "control", "exit", "silent", "long"],
+    ids=["base", "control", "exit", "silent", "exits in its text", "long"],
 )
 def test_a_plug_in_neither_ends_a_command_nor_writes_to_its_output(
     announced: list[EntryPoint], capsys: pytest.CaptureFixture[str], error: BaseException, said: str

@@ -47,6 +47,16 @@ def _beamline(*arguments: str) -> Result:
     return CliRunner().invoke(main, list(arguments))
 
 
+@pytest.mark.parametrize(
+    "command", ["segment loop.h5", "export scan.h5 -o loop.h5", "simulate plain --frames 2 --out loop.h5"]
+)
+def test_a_link_that_leads_to_itself_is_a_file_that_is_not_there(folder: Path, command: str) -> None:
+    (folder / "loop.h5").symlink_to("loop.h5")
+    result = _beamline(*command.split())
+    assert result.exit_code in (2, 5) and "loop.h5" in result.stderr, result.output
+    assert (folder / "loop.h5").is_symlink()
+
+
 def test_info_for_people(folder: Path) -> None:
     result = _beamline("info", "scan.h5")
     assert result.exit_code == 0, result.output

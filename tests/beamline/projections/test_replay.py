@@ -53,6 +53,17 @@ def test_a_foreign_file_is_judged(tmp_path: Path) -> None:
     assert np.flatnonzero(found.alarmed).tolist() == [24]  # two darks and two flats come before the views
 
 
+def test_foreign_byte_orders_and_floats_of_16_bits_are_judged_as_the_same_numbers() -> None:
+    data = np.r_[np.full((2, *SCAN.shape), DARK), np.full((2, *SCAN.shape), BEAM), SCAN.counts()]
+    data = data.astype("u2") // 32 * 32  # float16 holds these as they are
+    data[20, 3, :5] = 0
+    key, angles = [2, 2, 1, 1] + [0] * 30, np.r_[np.zeros(4), SCAN.angles]
+    sources = [ArraySource(data.astype(dtype), key, angles) for dtype in ("f4", ">u2", "f2")]
+    flags, *others = [[each.flags for each in replay(source)] for source in sources]  # type: ignore[arg-type]
+    assert any(flags)
+    assert others == [flags, flags]
+
+
 @pytest.mark.parametrize(("dtype", "value"), [("i8", 2**60), ("f8", -1e300), ("f8", math.inf)])
 @pytest.mark.parametrize("rows", ["dark", "flat", "view", "half a view", "an angle", "all darks", "all"])
 def test_pixels_and_angles_that_are_no_measurement_are_named_and_nothing_else_fails(

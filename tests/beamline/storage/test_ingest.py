@@ -147,7 +147,7 @@ def test_nothing_is_overwritten(stack: tuple[Path, np.ndarray], tmp_path: Path) 
 
 @pytest.mark.parametrize(
     ("angles", "said"),
-    [(None, "does not say the angles of its 9 projections"), (ANGLES[:4], "4 angles"), (ANGLES * np.nan, "angles")],
+    [(None, "the angles of 9 of its 9 projections"), (ANGLES[:4], "4 angles"), (ANGLES * np.nan, "angles")],
 )
 def test_projections_need_angles(
     stack: tuple[Path, np.ndarray], tmp_path: Path, angles: np.ndarray | None, said: str
