@@ -7,7 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -215,14 +215,18 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
 
 @contextmanager
 def json_events(as_json: bool) -> Iterator[Sink]:
-    """The sink for JSON on stdout, idle unless `as_json`. An error in the block becomes the event `failed`."""
+    """The sink for JSON on stdout, idle unless `as_json`. An error in the block becomes the event `failed`.
+
+    What anything else prints in the block, such as a plug-in, goes to stderr: stdout holds JSON alone.
+    """
     if not as_json:
         yield fan_out()
         return
     lines = JsonLines(sys.stdout)
     last: list[Event] = []
     try:
-        yield fan_out(last.append, lines)
+        with redirect_stdout(sys.stderr):
+            yield fan_out(last.append, lines)
     except (Exit, ClickException):
         raise
     except BaseException as error:

@@ -130,6 +130,22 @@ def look(
     return after, tuple(_from(look.flag, unbroken) for look in looks if look.flag is not None)
 
 
+def look_past_failures(
+    monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
+) -> tuple[Monitor, tuple[Flag, ...], tuple[str, ...]]:
+    """`look`, in which a check that fails is off from here on; last, a sentence on each that is now."""
+    failures: list[str] = []
+    while True:
+        try:
+            monitor, flags = look(monitor, frame, digest, begin)
+        except CheckError as failed:
+            monitor = without(monitor, failed.name)
+            cause = failed.__cause__
+            failures.append(f"{failed} at frame {frame.index} and is off, the other checks go on: {cause!r}")
+        else:
+            return monitor, flags, tuple(failures)
+
+
 def _without_holes(digest: FrameDigest) -> FrameDigest:
     """The digest with the frame's median in blocks without a valid pixel."""
     holes = np.isnan(digest.preview)

@@ -17,7 +17,7 @@ from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
-from beamline.monitor.watch import look, start, usual_step
+from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
@@ -45,6 +45,7 @@ class Judged:
         n: frames in the file so far.
         aside: which checks left out views so far.
         drift: of the light so far, in words; "" where it is within its limit.
+        failures: a sentence on each check that failed at this frame, and is off from here on.
     """
 
     row: int
@@ -53,6 +54,7 @@ class Judged:
     n: int
     aside: Aside
     drift: str = ""
+    failures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ class ScanVerdict:
         retaken: numbers of the views that were taken again.
         references: what is wrong with darks and flats, a text for each group.
         altered: what of the file is not as it was written; "" where all is.
-        aside: which checks could not look at which views.
+        aside: which checks could not look at which views, or failed.
         drift: of the light over the scan, in words; "" where it is within its limit.
     """
 
@@ -129,9 +131,9 @@ def replay(
     monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
-        monitor, flags = look(monitor, frame, seen)
+        monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift())
+        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
 
 
 def frames_of(
@@ -173,6 +175,7 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(rows_replaced(source).tolist())
     groups = reference_groups(source, limits).judged if source.quantity == "counts" else ()
+    failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
@@ -180,7 +183,8 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
         retaken=tuple(sorted(again)),
         references=tuple(group.described() for group in groups if group.faults),
         altered=altered_said(source) if source.altered else "",
-        aside=tuple(judged[-1].aside.said()) if judged else (),
+        aside=tuple(failure for each in judged for failure in each.failures)
+        + (judged[-1].aside.said() if judged else ()),
         drift=judged[-1].drift if judged else "",
     )
 

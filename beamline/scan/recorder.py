@@ -30,7 +30,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.rehearsal import rehearse
-from beamline.monitor.watch import CheckError, Monitor, look, without
+from beamline.monitor.watch import Monitor, look_past_failures
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
@@ -411,16 +411,13 @@ class Recorder:
         if self._monitor_off:
             return None
         try:
-            self._monitor, flags = look(self._monitor, frame, seen, self._begin_check)
-        except CheckError as failed:
-            self._monitor = without(self._monitor, failed.name)
-            message = f"{failed} at frame {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
-            self._sink(Warned(message))
-            return self._look(frame, seen)
+            self._monitor, flags, failures = look_past_failures(self._monitor, frame, seen, self._begin_check)
         except BaseException as error:
             self._monitor_off = True
             self._sink(Warned(f"the monitor failed at frame {frame.index} and is off: {error!r}"))
             return None
+        for failure in failures:
+            self._sink(Warned(failure))
         return flags
 
     def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:

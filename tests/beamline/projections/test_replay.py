@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.monitor.check import Flag, Level
+from beamline.monitor.check import Flag, Level, Look
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
+from beamline.monitor.saturation import SaturationCheck
 from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay, verdict
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -189,3 +195,34 @@ def test_stopping_ends_it_between_frames() -> None:
             stop.set()
     assert seen == [0, 1, 2, 3]
     assert judged.kind == FrameKind.PROJECTION
+
+
+class Fails(SaturationCheck):
+    """A check of another package, which prints, and returns what is no `Look` from one frame on."""
+
+    name = "fails"
+    bit = 40
+
+    def look(self, state: Any, frame: Frame, digest: Any, context: Any) -> Any:
+        print("heard")
+        return Look(state) if frame.index < 6 else None
+
+
+def test_a_check_that_fails_is_off_and_named_and_the_others_go_on() -> None:
+    counts = np.r_[np.full((2, *SCAN.shape), DARK), np.full((2, *SCAN.shape), BEAM), SCAN.counts()]
+    counts[20] = DARK
+    key, angles = [2, 2, 1, 1] + [0] * 30, np.r_[np.zeros(4), SCAN.angles]
+    source = ArraySource(counts.astype(np.uint16), key, angles)
+    alone, beside = (verdict(source, list(replay(source, checks))) for checks in (CHECKS, (*CHECKS, Fails())))
+    assert beside.kinds == alone.kinds and alone.alarmed == (20,)
+    assert [text for text in beside.aside if text not in alone.aside] == [
+        "the check fails failed at frame 6 and is off, the other checks go on: "
+        "TypeError('it returned None; expected a Look with a Flag or None')"
+    ]
+
+
+def test_what_a_plug_in_prints_stays_out_of_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_exchange(tmp_path / "s.h5", SCAN, {})
+    monkeypatch.setattr("beamline.monitor.checks.CHECKS", (*CHECKS, Fails()))
+    done = CliRunner().invoke(main, ["monitor", str(path), "--json"])
+    assert "heard" in done.stderr and [json.loads(line) for line in done.stdout.splitlines()]
