@@ -56,7 +56,8 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     base = _base(darks)
     light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
     lit = lit_places(light)
-    through = _without_drift(np.stack([_log(_cells(view, base), light, lit) for view in views]), lit)
+    stated = np.stack([_log(_cells(view, base), light, lit) for view in views])
+    through = _without_drift(stated, lit)
     spreads = np.array([_spread(each) for each in through])
     beyond = np.array([_beyond_noise(each) for each in through])
     nearest, noise = int(np.argmin(spreads)), float(np.median([noise_of(each) for each in through]))
@@ -67,6 +68,8 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
     if (depth := _depth_over_air(flats, darks, views)) is not None:
         brighter = min(brighter, -float(np.median(np.percentile(depth, 100 - WORST, axis=(1, 2)))))
+    else:  # the sample fills the field: less the drift, half of its places are brighter than the others
+        brighter = min(brighter, float(np.median(np.percentile(stated, WORST, axis=1))))
     limit = max(BRIGHTER * darker, BLOCK_SIGMAS * noise)
     if not brighter > limit > 0:
         return None

@@ -23,6 +23,7 @@ SOLID: Balls = [(0, 0, 0, 30, 0.004), (13, 6, 1, 7, 0.03), (-12, 10, -2, 6, 0.02
 WEAK: Balls = [(*ball, mu / 4) for *ball, mu in SOLID]  # type: ignore[misc]
 OFF: Balls = [(9, 5, 0, 14, 0.01)]
 ROUND: Balls = [(0, 0, 0, 25, 0.01)]
+WIDE: Balls = [(0, 0, 0, 86, 0.004), (60, 10, 0, 12, 0.03)]
 
 
 def depth(balls: Balls, angles: NDArray[np.float64], moved: float = 0.0) -> NDArray[np.float64]:
@@ -77,6 +78,15 @@ def test_a_single_group_of_flats_with_the_sample_in_is_refused(
     assert hit.message.startswith("The flats 4-7: ") and said in hit.message
 
 
+@pytest.mark.parametrize(("degrees", "refused"), [(None, False), (45.0, True)])
+def test_where_the_sample_fills_the_field_one_view_without_detail_is_no_flat(
+    degrees: float | None, refused: bool
+) -> None:
+    """No view has air: the ball within is in some views, and the others are smooth, as a drift of the beam is."""
+    held = np.zeros((ROWS, COLS)) if degrees is None else depth(WIDE, np.radians([degrees]))[0]
+    assert bool(told(scan(WIDE, held))) is refused
+
+
 def test_views_that_show_nothing_beside_their_flats_are_named() -> None:
     """A round sample that was never moved out, and no sample at all, cannot be told apart."""
     for balls in (ROUND, []):
@@ -93,9 +103,12 @@ def test_views_that_show_nothing_beside_their_flats_are_named() -> None:
         st.tuples(st.floats(0, 1), st.floats(0, 6.28), st.floats(-6, 6), st.floats(3, 18), st.floats(0.1, 3)),
         min_size=1, max_size=4,
     ),
-    st.floats(0, 0.5), st.integers(0, 99),
+    st.one_of(st.none(), st.floats(50, 110)), st.floats(0, 0.5), st.integers(0, 99),
 )  # fmt: skip
-def test_flats_without_the_sample_are_used(shapes: list[tuple[float, ...]], drift: float, seed: int) -> None:
-    """Whatever balls there are, the field may cut them off, too."""
+def test_flats_without_the_sample_are_used(
+    shapes: list[tuple[float, ...]], around: float | None, drift: float, seed: int
+) -> None:
+    """Whatever balls there are, the field may cut them off, too, or lie within a larger one."""
     balls = [(far * 46 * np.cos(at), far * 46 * np.sin(at), z, r, most / (2 * r)) for far, at, z, r, most in shapes]
+    balls += [] if around is None else [(0, 0, 0, around, 0.25 / around)]
     assert told(scan(balls, np.zeros((ROWS, COLS)), drift, seed)) == []
