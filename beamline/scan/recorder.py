@@ -46,6 +46,7 @@ STALL = 60.0  # real s that a write may take, after which the disk counts as dea
 SLICE = 0.25  # real s: the longest wait for room, or for a frame, between two looks at the stop request
 CHECKS = 60.0  # real s that the checks may take for a frame, after which they count as hanging
 COMPILES = 300.0  # the same of their rehearsal, which compiles once on a machine
+REHEARSED = 10.0  # real s of it, after which the scan says what it waits for
 STOPPED, ABORTED = 5.0, 1.0  # the same after a request to stop, and to abort
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
@@ -126,6 +127,7 @@ class Recorder:
         """The frame that the first thread works on (None: the rehearsal), and since when. Whoever takes it out hands it
         on: the first thread, or the second one, which goes on alone from then on."""
         self._alone = False
+        self._told_of_rehearsal = False
         self.n_frames = 0
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
@@ -328,6 +330,14 @@ class Recorder:
             usual = COMPILES if frame is None else CHECKS
             limit = ABORTED if self._stop.aborting else STOPPED if self._stop.stopping else usual
             if (seconds := time.monotonic() - since) <= limit:
+                if frame is None and seconds > REHEARSED and not self._told_of_rehearsal:
+                    self._told_of_rehearsal = True
+                    self._sink(
+                        Warned(
+                            f"The check {self._check_name} is being rehearsed for {seconds:.0f} s now, which compiles "
+                            f"what it needs. Frames wait; without an answer in {COMPILES:.0f} s the monitor is off."
+                        )
+                    )
                 return
             if (taken := self._under_checks.pop()) is not looked_at:  # it came back, and has the next frame
                 self._under_checks.append(taken)

@@ -15,11 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
+from beamline.core.events import Event, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.mass import MassCheck
-from beamline.monitor.watch import start
+from beamline.monitor.watch import Monitor, start
 from beamline.scan import recorder as module
 from beamline.scan import run as run_module
 from beamline.scan.recorder import Recorder
@@ -243,12 +244,33 @@ def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pyt
     def broken(*_: object) -> None:
         raise ZeroDivisionError("defect")
 
-    monkeypatch.setattr(module, "look", broken)
+    monkeypatch.setattr(module, "look_past_failures", broken)
     ran = Ran(tmp_path, FakeInstrument())
     assert ran.error is None
     ran.assert_good_file(19, "complete")
     off, unjudged = (event.data["message"] for event in ran.of("warning"))
     assert "monitor failed at frame 0" in off and "did not look at 19 frames (0-18)" in unjudged
+
+
+def test_a_rehearsal_that_takes_long_is_told_while_it_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    told, messages = threading.Event(), list[str]()
+
+    def slow(monitor: Monitor, begin: Callable[[str], None]) -> None:
+        begin("mass")
+        assert told.wait(30.0)
+
+    def sink(event: Event) -> None:
+        if isinstance(event, Warned):
+            messages.append(event.message)
+            told.set()
+
+    monkeypatch.setattr(module, "rehearse", slow)
+    monkeypatch.setattr(module, "REHEARSED", 0.1)
+    recorder = Recorder(Writer(), start(ScanContext(65535, 4, period=1.0)), TIMELINE, preview_bin=2, sink=sink)
+    recorder.put(frame(0))
+    recorder.finish()
+    message, *_ = messages
+    assert message.startswith("The check mass is being rehearsed for 0 s now") and recorder.n_frames == 1
 
 
 def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
