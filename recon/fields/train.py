@@ -172,9 +172,9 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     if method.seconds is not None and fit.step < min(used.size, method.steps):
         pace = fit.seconds_of_steps / max(fit.step, 1)
         warnings.warn(
-            f"the {method.label} field ended after {fit.step} steps, before it saw each of its {used.size} views once: "
-            f"its volume shows little of the sample. A step takes about {pace:.2g} s here, so give about "
-            f"{pace * used.size:.2g} s more",
+            f"{method.label} ended after {fit.step} steps, before it saw each of its {used.size} views once: its "
+            f"volume shows little of the sample. A step takes about {pace:.2g} s here, so give about "
+            f"{pace * (used.size - fit.step):.0f} s more",
             stacklevel=2,
         )
     volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)

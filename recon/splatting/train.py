@@ -407,7 +407,7 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
     then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
     warnings.warn(
-        f"{method.seconds:.3g} s do not suffice for the start of the fit, which takes about {needed:.3g} s: "
+        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
         f"{then if factor > 1 else 'it ends late'}",
         stacklevel=2,
     )
