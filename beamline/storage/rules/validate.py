@@ -22,6 +22,7 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import LookedEnoughError, ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
@@ -393,6 +394,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_known,
     angles_spread,
     angles_seen,
+    angles_in_order,
     quantity_said,
     references_present,
     exposures_agree,
