@@ -268,9 +268,7 @@ def _turn_seen(
     around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
-    if abs(turned - period) <= max(OTHER * period, 2 * step) or not best < min(
-        2 * near, off / UNLIKE, usual / UNLIKE
-    ):
+    if abs(turned - period) <= max(OTHER * period, 2 * step) or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
