@@ -54,8 +54,8 @@ def _apart(turned: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lit(seen: CoarseViews, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """A few of the pairs of frames, evenly spread, with light."""
-    at = np.unique(np.linspace(0, len(pairs) - 1, PAIRS).astype(int)) if pairs else []
-    return [pairs[i] for i in at if all(seen.lit(row) for row in pairs[i])]
+    some = sorted({round(i * (len(pairs) - 1) / (PAIRS - 1)) for i in range(PAIRS)}) if pairs else []
+    return [pairs[i] for i in some if all(seen.lit(row) for row in pairs[i])]
 
 
 def _stated(source: ScanSource, pair: tuple[int, int]) -> str:
