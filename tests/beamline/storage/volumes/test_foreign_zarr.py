@@ -167,7 +167,7 @@ def test_a_voxel_without_a_size_is_refused(tmp_path: Path, scale: float) -> None
     said = group.attrs["multiscales"]
     said[0]["datasets"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [1.0, 1.0, scale]}]
     group.attrs["multiscales"] = said
-    with pytest.raises(DataError, match="expected (lengths above 0|3 numbers)"):
+    with pytest.raises(DataError, match=r"expected (lengths above 0|3 numbers)"):
         open_zarr(tmp_path / "v.zarr")
 
 
