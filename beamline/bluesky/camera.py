@@ -38,7 +38,7 @@ from beamline.scan.run_folder import SCAN, create_run_folder
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
-from drivers.base.protocols import CameraSettings, TriggerSource
+from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource
 
 PATIENCE = 5.0
 """s beyond the exposure after which a frame that the detector triggered is lost."""
@@ -172,7 +172,7 @@ class _Frames(DetectorAcquireLogic):
             self._lacking = range(writer.rows, self._lacking.stop)
             camera.disarm()
 
-    def _next(self, patience: float) -> Frame | None:
+    def _next(self, patience: float) -> CameraFrame | None:
         """The next frame; None where the frames are to end. DeviceTimeout: none has come for so many s."""
         waited = 0.0
         while not self._stop.is_set():
