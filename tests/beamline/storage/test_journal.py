@@ -163,7 +163,8 @@ def test_what_is_put_in_the_place_of_a_journal_is_not_waited_for(path: Path, way
     "head",
     [
         "[]", '{"length": 1}', '{"length": true, "ranges": []}', '{"length": -1, "ranges": []}', "[" * 10**5, "\xff",
-        '{"length": 9, "ranges": [[-1, 1, 1]]}', '{"length": 9, "ranges": [[1.5, 1, 1]]}', f'{{"length": {"9" * 5000}}}',
+        '{"length": 9, "ranges": [[-1, 1, 1]]}', '{"length": 9, "ranges": [[1.5, 1, 1]]}',
+        f'{{"length": {"9" * 5000}}}',
         '{"length": 9, "ranges": [[1, 1]]}', '{"length": 9, "ranges": 7}',
     ],
     ids=range(11),
