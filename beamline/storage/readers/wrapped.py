@@ -15,7 +15,7 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
-UNPACKED, _READ = 2**30, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
 class WrappedSource(ScanSource):
