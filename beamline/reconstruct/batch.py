@@ -16,6 +16,7 @@ from typing import Any, Literal, Self, get_args
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file
+from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.core.text import size
 from beamline.storage.writer_lock import WriterLock, held
@@ -223,9 +224,9 @@ def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) ->
     start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
     for tried, n in enumerate(waiting):
         spent = clock.now() - start
-        seconds_left = spent / tried * (len(waiting) - tried) if tried else None
+        eta = seconds_left(tried, len(waiting), spent)
         rate = 60 * tried / max(spent, 1e-9)
-        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, seconds_left, rate, time=clock.now()))
+        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
         rows[n] = _one(rows[n], options, worker, sink, clock)
         _write(folder, rows)
         row = rows[n]
