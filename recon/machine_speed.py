@@ -27,6 +27,7 @@ from recon.methods import by_name, with_settings
 from recon.reconstruction import reconstruct
 from recon.series import MOMENTS, TimedViews, of_moments
 from recon.splatting import optimise
+from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, sample_gaussians
 from recon.splatting.settings import FitSettings
@@ -95,7 +96,8 @@ def _geometry(beam: str, rows: int, cols: int, views: int) -> Geometry:
 
 
 def _sweeps(beam: str, single: bool = False) -> tuple[_Timed, ...]:
-    sizes = ((1, 96), (1, 512)) if beam == "slice" else ((8, 160), (96, 192))
+    several = ((2, 256), (64, 192)) if single else ((8, 160), (96, 192))
+    sizes = ((1, 96), (1, 512)) if beam == "slice" else several
     return tuple(_swept(beam, *size, single) for size in sizes)
 
 
@@ -144,13 +146,17 @@ def _patched(shape: tuple[int, int, int]) -> Callable[[], object]:
     return lambda: denoise(x, 0.1, True, scratch, out)
 
 
-_FBP = {"rays": (256, 60), "gridding": (512, 180)}  # columns and views for which FBP takes either way
+_FBP = {  # rows, columns and views for which FBP takes either way
+    "rays": ((48, 96, 60), (16, 320, 60)),
+    "gridding": ((16, 512, 180),),
+}
 
 
 def _filtered(which: str) -> tuple[_Timed, ...]:
-    geometry, grid, data = _lines("parallel", 16, *_FBP[which])
-    amounts = direct_work(geometry, grid).amounts[f"fbp, {which}"]
-    return (_Timed(*amounts, partial(direct, data, geometry, grid, "hann")),)
+    return tuple(
+        _Timed(*direct_work(geometry, grid).amounts[f"fbp, {which}"], partial(direct, data, geometry, grid, "hann"))
+        for geometry, grid, data in (_lines("parallel", *size) for size in _FBP[which])
+    )
 
 
 def _back_projected(which: str) -> tuple[_Timed, ...]:
@@ -191,6 +197,19 @@ def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> _Timed:
             optimise.step(state, problem, settings, 0.0)
 
     return _Timed(views, views * covered(math.prod(grid.shape), gaussians.n), run)
+
+
+def _normalised(which: str) -> tuple[_Timed, ...]:
+    return _made_problem(16, 96), _made_problem(64, 160)
+
+
+def _made_problem(rows: int, cols: int) -> _Timed:
+    geometry, grid, data = _lines("parallel", rows, cols, 12)
+    return _Timed(
+        geometry.n_views,
+        data.size,
+        lambda: optimise.problem_of(data, geometry, grid, 1.0, FitSettings(), backend_for("cpu")),
+    )
 
 
 def _matter(grid: Grid) -> Volume:
@@ -264,8 +283,9 @@ OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
     ),  # a dual step of total variation, or the end of some: lines, voxels
     "slope": lambda which: _on_volume(_sloped),  # of total variation: lines, voxels
     "patches": lambda which: _on_volume(_patched),  # lines, voxels
-    "fbp": _filtered,  # 0, s on the machine of docs/notes/performance.md; by rays or by gridding
+    "fbp": _filtered,  # rays, s on the machine of docs/notes/performance.md; by rays or by gridding
     "back-projection": _back_projected,  # lines x views, voxels x views; of a cone or of views in any pose
+    "views": _normalised,  # the data of a fit: views, rays
     "view": _fitted,  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
     "draw": _draws,  # first Gaussians: Gaussians, voxels
     "fill": _fills,  # the volume of Gaussians: Gaussians, voxels

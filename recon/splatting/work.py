@@ -21,6 +21,8 @@ from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.pnp_dct import TRIAL_STEPS
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
+_RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
+
 
 def covered(voxels: float, gaussians: float) -> float:
     """In proportion to the pixels that Gaussians cover in a view, whose widths are their distances."""
@@ -47,7 +49,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
         share = part[0].detector_shape[0] / geometry.detector_shape[0]
         own = method.for_trial(share)
         refined = fista_sweeps(*part, SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
-        trial = _fit(own, *part, own.planned_steps or 0) + refined
+        trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
     return Costs(volumes, weight + patches + trial)
 
 
@@ -61,18 +63,31 @@ def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
     joined = method.fit.joined_pixels or joined_for(field, cone, max(count, usual), geometry.detector_shape)
     first = start_method(geometry, method.start)
     start = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
+    rays = geometry.n_views * math.prod(geometry.detector_shape) / joined**2
     start = start * (1 / joined**3) + Work.of("draw", count, voxels / joined**3)
+    start += Work.of("views", geometry.n_views, rays)
+    views = steps * method.fit.views_per_step + _RENDER * SCALED_BY
     grown = count * (1 + growth(method.fit)) / 2
+    fill = Work.of("fill", grown, math.prod(grid.shape))
+    return start + views * _view(method, geometry, voxels / joined**3, grown) + fill
+
+
+def _view(method: FitMethod, geometry: Geometry, voxels: float, gaussians: float) -> Work:
+    """A view of a step of a fit."""
     reach = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
-    pixels = covered(voxels / joined**3, grown) * reach**2
-    beam = "cone" if cone else "parallel"
-    views = steps * method.fit.views_per_step + SCALED_BY / 3  # a render is a third of a view's share in a step
-    return start + Work.of(f"view, {beam}", views, views * pixels) + Work.of("fill", grown, math.prod(grid.shape))
+    return Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, gaussians) * reach**2)
+
+
+def _rendered(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
+    """All views of the Gaussians, and once more of what no voxels explain."""
+    field = Grid.for_fit(geometry, grid)
+    count = method.gaussians if isinstance(method.gaussians, int) else count_for(field, geometry.is_cone)
+    return 2 * _RENDER * geometry.n_views * _view(method, geometry, math.prod(field.shape), count)
 
 
 def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
     """The refinement on voxels, with steps of sparse patches where these may follow."""
-    refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS))
+    refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS)) + _rendered(method, geometry, grid)
     refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
     return refined if method.finish is not None else refined + patch_steps(geometry, grid, PnpDct().iterations)
 
@@ -84,7 +99,7 @@ def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
     view = Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, count))
     first = start_method(geometry, "fbp")
     volume = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
-    start = Work.of("draw", count, voxels) + SCALED_BY / 3 * view
+    start = Work.of("draw", count, voxels) + _RENDER * SCALED_BY * view
     try:
         sweep = fista_sweeps(geometry, grid, 1, SUBSETS, TV_STEPS).seconds(rates)
         trials = weight_choice(geometry, grid).seconds(rates) if geometry.n_views >= LEAST_VIEWS else 0.0

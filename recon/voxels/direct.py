@@ -204,7 +204,8 @@ def direct_work(geometry: Geometry, grid: Grid) -> Work:
     ways = nanoseconds(views, cols, (ny, nx), nz, partial(ramp, pixel_pitch=1.0, filter="hann"))
     blocks = -(-nz // SLICES)
     way = "rays" if ways[0] <= ways[1] else "gridding"
-    return Work.of(f"fbp, {way}", 0.0, 1e-9 * min(ways) * blocks)
+    rays = 0.0 if way == "gridding" else float(views * SLICES * blocks * cols)  # gridding has them among its points
+    return Work.of(f"fbp, {way}", rays, 1e-9 * min(ways) * blocks)
 
 
 def has_direct_method(geometry: Geometry) -> bool:

@@ -34,8 +34,8 @@ TRIAL_ROWS = 16
 
 TRIAL_SWEEPS, SUBSETS, TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels, and a shell of hardly any noise, take 6 to 9
-TRIALS = 5
-"""Trials of a strength, as a rule: the walnut takes 6, the Diamond scan and a cone 5, simulated batteries 4."""
+TRIALS = 4
+"""Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
 CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
@@ -171,7 +171,7 @@ def alike_of(problem: VoxelProblem) -> float:
 
 
 def choice_sweeps(geometry: Geometry) -> float:
-    """What `choose_weight` costs, in sweeps over all rows: five trials as a rule; 0 where nothing is held out."""
+    """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
