@@ -14,7 +14,7 @@ from beamline.cli.options import dry_option, json_events, json_option
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import BeamlineError, DataError, ScanStopped
 from beamline.core.events import Done
-from beamline.reconstruct.batch import TABLE, BatchOptions, ScanNeeds, planned_batch, run_batch
+from beamline.reconstruct.batch import TABLE, BatchOptions, Need, planned_batch, run_batch
 from drivers.base.clock import SystemClock
 
 
@@ -32,7 +32,7 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
     return list(scans)
 
 
-def _needs_of(config: Path | None, scan: str) -> ScanNeeds:
+def _needs_of(config: Path | None, scan: str) -> Need:
     """What `beamline recon SCAN --dry-run` says."""
     from beamline.cli.recon import recon  # the batch itself needs none of it
 
@@ -42,9 +42,9 @@ def _needs_of(config: Path | None, scan: str) -> ScanNeeds:
         with redirect_stdout(lines):
             recon.main(arguments, prog_name="beamline recon", standalone_mode=False)
     except (BeamlineError, click.ClickException) as error:
-        return ScanNeeds(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
+        return Need(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
     told = json.loads(lines.getvalue().splitlines()[-1])
-    return ScanNeeds(told["seconds"], told["memory"], told["output"] + told.get("scratch", 0))
+    return Need(told["seconds"], told["memory"], told["output"] + told.get("scratch", 0))
 
 
 @click.command()

@@ -99,7 +99,7 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
 
 
 @dataclass(frozen=True)
-class ScanNeeds:
+class Need:
     """What the reconstruction of a scan takes.
 
     Attributes:
@@ -128,7 +128,7 @@ class BatchPlan:
 
     folder: Path
     rows: Sequence[BatchRow]
-    needs: Mapping[str, ScanNeeds]
+    needs: Mapping[str, Need]
     seconds: float
     memory: int
     disk: int
@@ -158,7 +158,7 @@ class BatchPlan:
         return "" if needs is None or needs.seconds is None else duration_text(needs.seconds)
 
 
-def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeeds]) -> BatchPlan:
+def planned_batch(options: BatchOptions, needs_of: Callable[[str], Need]) -> BatchPlan:
     """What `run_batch` would do. Nothing is written, and no frame is read.
 
     Args:
