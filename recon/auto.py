@@ -15,12 +15,14 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import ChoosingMethod, Method, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import CostedMethod, Costs
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
-from recon.trials import of_views, part_of, predicts_best
+from recon.trials import ROWS, of_views, part_of, predicts_best
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct, prior_of
+from recon.voxels.work import patch_choice, trial_part, weight_choice
 
 
 def _candidates() -> tuple[Method, ...]:
@@ -90,6 +92,19 @@ class Auto:
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        """Of trials of all candidates; a sample wider than the field has none."""
+        methods = [
+            method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
+        ]
+        costed = [method for method in methods if isinstance(method, CostedMethod)]
+        part = trial_part(geometry, grid, ROWS)
+        if part is None:
+            return costed[-1].costs(geometry, grid)
+        volumes = {name: work for method in costed for name, work in method.costs(geometry, grid).volumes.items()}
+        trials = [work for method in costed for work in method.costs(*part).volumes.values()]
+        return Costs(volumes, sum(trials, weight_choice(geometry, grid) + patch_choice(geometry, grid)))
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)

@@ -17,8 +17,9 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
+from recon.learnt_motion import JUDGED, JUDGED_SWEEPS, SWEEPS_OF_TURN, OfMoments, learnt_motion, levels, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
 from recon.voxels.held_out import ONE_IN, beyond_chance, busiest_rows, slab_of
@@ -30,6 +31,10 @@ _MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in tim
 _SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
 _LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
+_TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24 * 16 at most
+_TURN = 4  # sweeps that the steps of a motion take, beside its own
+_FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
+SWEEPS = 60
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
 
@@ -111,7 +116,7 @@ def fit_series(
     *,
     motion: bool | None = None,
     tv_weight: float | None = None,
-    sweeps: int = 60,
+    sweeps: int = SWEEPS,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
@@ -249,6 +254,32 @@ def refuse_few(knots: int, n: int) -> None:
         raise ValueError(
             f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
         )
+
+
+def series_costs(geometry: Geometry, knots: int, motion: bool | None, sweeps: int = SWEEPS) -> Costs:
+    """The work of `fit_series`: of a sample at rest, and of one that moves, where these are open.
+
+    Raises:
+        ValueError: the views do not suffice for so many volumes.
+    """
+    refuse_few(knots, geometry.n_views)
+    cols, grid = geometry.detector_shape[1], Grid.matching(geometry)
+    voxels = math.prod(grid.shape)
+    few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
+
+    def swept(moves: bool, sweeps: float, share: float = 1.0) -> Work:
+        views = sweeps * geometry.n_views
+        return Work.of(f"series, {'moving' if moves else 'still'} {knots}", views, views * share * voxels)
+
+    learning = sum((swept(True, n * (SWEEPS_OF_TURN + _TURN), wide**-3) for wide, n in levels(cols)), Work())
+    rest = swept(False, sweeps + _FACTORS[1]) + swept(False, sweeps + _FACTORS[0], few)
+    volumes = {"rest": rest, "moving": learning + swept(True, sweeps)}
+    choice = swept(False, _TRIALS, few)
+    if motion is not None:
+        return Costs({"moving" if motion else "rest": volumes["moving" if motion else "rest"]}, choice)
+    coarse = max(1, round(cols / JUDGED)) ** -3
+    judging = learning + swept(False, JUDGED_SWEEPS, coarse) + swept(True, JUDGED_SWEEPS, coarse)
+    return Costs(volumes, choice + judging)
 
 
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:

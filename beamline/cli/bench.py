@@ -14,6 +14,7 @@ from beamline.cli.options import POSITIVE, json_events, json_option, parsed
 from beamline.cli.terminal import events_shown
 from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line
+from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from drivers import orca_quest
 from drivers.base.clock import SystemClock
@@ -82,9 +83,9 @@ def acquire(
         began = clock.now()
 
         def progress(n: int, of: int, stage: str) -> None:
-            per_min = 60 * n / max(clock.now() - began, 1e-9)
-            seconds_left = (of - n) * 60 / per_min if n else None
-            sink(TrialReached("bench", n, of, stage, seconds_left, per_min, time=clock.now()))
+            spent = clock.now() - began
+            per_min = 60 * n / max(spent, 1e-9)
+            sink(TrialReached("bench", n, of, stage, seconds_left(n, of, spent), per_min, time=clock.now()))
 
         for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)

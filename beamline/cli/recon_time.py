@@ -55,6 +55,7 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
     refuse_shared({"FILE": file, "--output": output})
     require_there(file, values["as_json"])
     # Imported here: help needs none of it.
+    from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.reconstruct.time_series import SeriesRequest, reconstruct_series, series_needs
@@ -69,7 +70,7 @@ def recon_series(context: click.Context, file: Path, output: Path | None, values
     clock, request, series = SystemClock(), SeriesRequest(values["volumes"], values["moves"]), None
     with events_shown(values["as_json"]) as sink:
         if values["dry"]:
-            needs = series_needs(options, request, clock)
+            needs = series_needs(options, request, MachineSpeed())
         else:
             series = reconstruct_series(
                 options, request, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)

@@ -37,10 +37,9 @@ from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.series import TimedViews, fit_series
-from recon.series_time import series_seconds
+from recon.base.work import Rates, seconds_of
+from recon.series import SWEEPS, TimedViews, fit_series, series_costs
 
-_SWEEPS = 60
 _COPIES = 7  # of all line integrals: views, lines, a part held out, moments, binned views, weights
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each volume of the series; for displacements and what they displace
 
@@ -109,17 +108,17 @@ class SeriesNeeds:
         return [*lines, f"{'time':<10}about {least} to {most}, reading and correction not counted"]
 
 
-def series_needs(options: ReconOptions, request: SeriesRequest, clock: Clock) -> SeriesNeeds:
+def series_needs(options: ReconOptions, request: SeriesRequest, rates: Rates) -> SeriesNeeds:
     """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
     with options.source.open() as source:
         geometry = stated_geometry(source, options.selection)
     needs = SeriesNeeds.of(options, request, geometry)
     needs.refuse()
     try:
-        most, least = series_seconds(geometry, request.volumes, request.moves, _SWEEPS, clock.now)
+        span = seconds_of(series_costs(geometry, request.volumes, request.moves), rates)
     except ValueError as error:
         raise ConfigError(f"--time {request.volumes}: {error}. Nothing was written.") from error
-    return replace(needs, seconds=most, least_seconds=least)
+    return replace(needs, seconds=span.most, least_seconds=span.least)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +219,7 @@ def reconstruct_series(
     options.target.require_room(SeriesNeeds.of(options, request, prepared.geometry).output)
     phases.enter("reconstruction")
     fit_began = clock.now()
-    early, heard = False, sweeps_told(counting, _SWEEPS)
+    early, heard = False, sweeps_told(counting, SWEEPS)
 
     def go_on(sweep: int, residual: float) -> bool:
         nonlocal early
@@ -235,7 +234,7 @@ def reconstruct_series(
         with stop() as stopping:
             views = TimedViews(np.asarray(data, np.float32), prepared.geometry, times, weights)
             made = fit_series(
-                views, request.volumes, motion=request.moves, sweeps=_SWEEPS, seed=options.seed, go_on=go_on,
+                views, request.volumes, motion=request.moves, sweeps=SWEEPS, seed=options.seed, go_on=go_on,
                 stop=stopping,
             )  # fmt: skip
             early = early or stopping()

@@ -28,10 +28,10 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, choose_weight, is_coarse, simplest
 from recon.voxels.iterative import prior_decisions, solve
-from recon.voxels.methods.pnp_dct import TRIAL_STEPS, TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import pnp_dct
+from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 

@@ -16,6 +16,7 @@ from recon.base.choices import DEFAULT_STEPS, MODEL_STEPS, Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
@@ -24,6 +25,7 @@ from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
+from recon.splatting.work import fit_costs
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 
@@ -161,6 +163,9 @@ class R2:
             rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return fit_costs(self, geometry, grid)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians

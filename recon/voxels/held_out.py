@@ -32,9 +32,11 @@ _ERRORS = 1.0  # standard errors of the difference, up to which two candidates p
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-_SWEEPS, _SUBSETS, _TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
+TRIAL_SWEEPS, SUBSETS, TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels, and a shell of hardly any noise, take 6 to 9
-CHOICE_SWEEPS = 4 * _SWEEPS
+TRIALS = 4
+"""Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
+CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
 _ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
@@ -261,7 +263,7 @@ class HeldOutTrial:
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
         self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
-        self._subsets = Subsets.of(problem, _SUBSETS)
+        self._subsets = Subsets.of(problem, SUBSETS)
         self._ended = False
         self._known: dict[tuple[str, float], F64] = {}
 
@@ -342,7 +344,7 @@ class HeldOutTrial:
     def with_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""
         return self.made(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=_SWEEPS, tv_steps=_TV_STEPS
+            part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
         ))  # fmt: skip
 
     def made(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:

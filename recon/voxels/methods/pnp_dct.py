@@ -14,9 +14,12 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
+    TRIAL_SWEEPS,
+    TRIALS,
     HeldOutTrial,
     alike_of,
     choose_weight,
@@ -27,13 +30,12 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import prior_decisions, run_iterative, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
+from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
+from recon.voxels.work import patch_choice, patch_steps
 
 _FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
-TRIAL_STEPS = 15
-"""Steps of a trial of patches, three rounds."""
 TRIAL_THRESHOLD = 1.6
 """Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
@@ -69,7 +71,7 @@ class PnpDct:
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * TRIAL_STEPS
+        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * TRIAL_STEPS
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
@@ -100,6 +102,12 @@ class PnpDct:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        first = FistaTv().costs(geometry, grid)
+        choice = patch_choice(geometry, grid) if self.patch_threshold is None else Work()
+        work = first.volumes[FistaTv.name] + patch_steps(geometry, grid, self.iterations)
+        return Costs({self.name: work}, first.choice + choice)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape

@@ -16,7 +16,7 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.projections.selection import Selection
 from beamline.storage.volumes.files import opened_volume
-from recon.run_time import RunTime
+from recon.base.work import CLOCK, Costs, Work
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
 
@@ -40,7 +40,7 @@ def weight_given() -> Iterator[None]:
     """No trials of weights, which take most of the time; tests/recon/test_series.py has them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("recon.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
-        patched.setattr("beamline.reconstruct.time_series._SWEEPS", 30)
+        patched.setattr("beamline.reconstruct.time_series.SWEEPS", 30)
         yield
 
 
@@ -167,9 +167,9 @@ def test_what_does_not_go_together_is_one_line(
 def test_a_dry_run_states_the_memory_and_writes_nothing(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its seconds are predicted from small fits, which tests/recon/test_series_time.py has."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("beamline.reconstruct.time_series.series_seconds", lambda *_: RunTime(70.0, 30.0))
+    costs = Costs({"rest": Work.of(CLOCK, 30.0), "moving": Work.of(CLOCK, 70.0)})
+    monkeypatch.setattr("beamline.reconstruct.time_series.series_costs", lambda *_: costs)
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert "2 of 2 x 40 x 40 voxels, from 36 views" in done.output
