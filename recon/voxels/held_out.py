@@ -1,15 +1,14 @@
 """Views held out: how strengths, priors and methods are chosen, and the trials that judge them.
 
 One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
-view held out is measured. A strength and the method of `auto` are those of the least residual. Where a candidate is
-simpler and cheaper than another, they are compared view by view, since views differ more than candidates do: of those
-within one standard error of the best, the simplest is taken.
+view held out is measured. The candidate of the least mean residual is taken. Two candidates are compared view by view
+where a search, or a trial fit, may end before all has been tried: views differ more than candidates do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -44,18 +43,6 @@ _AIR = 0.03  # of the largest line integral: columns below see air
 _BESIDE = 0.05  # of the width of the matter: air that trials see on either side
 _NARROWER = 0.9  # of the columns: wider matter is not worth a cut
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
-
-
-def simplest(residuals: Sequence[F64]) -> int:
-    """Which candidate to take, by residuals [view held out] of each, from the simplest to the most costly one.
-
-    The first whose residuals exceed those of the best by no more than one standard error of the mean difference.
-    """
-    best = min(residuals, key=lambda residual: float(residual.mean()))
-    alike = (
-        n for n, residual in enumerate(residuals) if residual is best or not beyond_chance(residual - best, _ERRORS)
-    )
-    return next(alike)
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
