@@ -38,7 +38,7 @@ class R2:
 
     Attributes:
         steps: of the fit. 0 gives the starting point. None takes 400, or 50 where views held out say that voxels alone
-            predict as well: then they make the volume, see `finish.best_candidate`. With `seconds` it takes as many as
+            predict as well: then they make the volume, see `finish.judged`. With `seconds` it takes as many as
             fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
@@ -106,9 +106,10 @@ class R2:
         """The fit that competes with methods on voxels: it is made, whatever they predict."""
         return replace(self, steps=self.planned_steps) if self.by_content else self
 
-    def for_trial(self, share: float) -> Self:
-        """The fit alone, of this share of the rows."""
-        return replace(self.as_candidate().for_part(share, 1.0), finish=0)
+    def for_trial(self, share: float, of_steps: float) -> Self:
+        """The fit alone, of this share of the rows, with this share of the steps."""
+        steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
+        return replace(self.for_part(share, 1.0), steps=steps, finish=0)
 
     @property
     def finish_sweeps(self) -> int:

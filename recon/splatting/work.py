@@ -8,7 +8,7 @@ from recon.assess.plans import Speeds
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import CLOCK, Costs, Rates, Work
-from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
+from recon.splatting.finish import FIRST_SHARE, SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_method
@@ -47,7 +47,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     trial = Work()
     if (part := trial_part(geometry, grid)) is not None:
         share = part[0].detector_shape[0] / geometry.detector_shape[0]
-        own = method.for_trial(share)
+        own = method.for_trial(share, FIRST_SHARE)
         refined = fista_sweeps(*part, SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
         trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
     return Costs(volumes, weight + patches + trial)

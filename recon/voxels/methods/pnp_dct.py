@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
@@ -25,13 +23,11 @@ from recon.voxels.held_out import (
     choose_weight,
     is_coarse,
     preferred_strength,
-    simplest,
 )
-from recon.voxels.iterative import prior_decisions, run_iterative, solve
+from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
-from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import patch_choice, patch_steps
 
@@ -141,18 +137,18 @@ def choose_patches(
     """
 
     def chosen() -> list[float]:
-        first = _FIRST * noise_of_volume(problem)
-        judge = None if isinstance(weight, NoiseBalance) or first == 0 else trial()
-        if judge is None or isinstance(weight, NoiseBalance):
+        judge = None if isinstance(weight, NoiseBalance) else trial()
+        first = _FIRST * noise_of_volume(problem if judge is None else judge.problem)
+        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
-        smooth = judge.with_weight(weight)
+        smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
         found = preferred_strength(partial(residuals_of_patches, judge, smooth), first, alike_of(problem))
         if found is None:
             return [first, 0]
         judge.keep("patches", found)
         if is_coarse(problem.projector.geometry, problem.projector.grid):
             return [found.strength, 0]
-        return [found.strength, simplest([judge.of_weight(weight), found.residuals])]
+        return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
@@ -165,29 +161,3 @@ def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
         return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
 
     return trial.residuals_of("patches", strength, made)
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """The search for a prior as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is."""
-
-    iterations: int = 1
-
-    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        trial = cache(partial(HeldOutTrial.of, problem))
-        choose_patches(problem, choose_weight(problem, x, modelled=False, trial=trial), trial)
-        return x
-
-
-def prior_of(problem: ReconProblem, on_trial: Callable[[], bool]) -> dict[str, Sequence[Any]]:
-    """Decisions on both priors by views held out, for any method on voxels; none where nothing can be held out.
-
-    Args:
-        on_trial: called after each sweep of a trial; true ends them, without a decision.
-    """
-    data, known = masked(problem.projections, problem.use.weights)
-    if not data.any():
-        return {}
-    decide, projector = Decisions(problem.seed), Projector(problem.geometry, problem.grid)
-    solve(_Prior(), projector, data, weight=known, on_trial=on_trial, decide=decide)
-    return prior_decisions(decide.made)
