@@ -47,12 +47,15 @@ REGISTRY: dict[str, MethodEntry] = {
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
     "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
+    "series": MethodEntry("recon.series", "Series", compared=False),
     "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
     "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
     "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),
 }
 
 DEFAULT = "r2"  # The default method
+
+IN_TIME = "series"  # The method of volumes in time
 
 BASELINE = "fbp"  # Reports compare all methods with this one
 

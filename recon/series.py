@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.units import warn_of_other_quantity
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume, VolumesInTime
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
@@ -31,6 +33,8 @@ _SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_
 _LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the series; for displacements and what they displace
+_COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
 
 
@@ -263,3 +267,98 @@ def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F
     shares /= np.bincount(moment)[:, None]
     past = (at - times[0]) / np.ptp(times)
     return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past
+
+
+@dataclass(frozen=True)
+class Series:
+    """Volumes at even times of one scan of a sample that changes, see `fit_series`.
+
+    Attributes:
+        volumes: 2 or more, from the first view to the last; each needs twelve views or more.
+        moves: matter moves, and not only its density changes; None: what views held out prefer.
+        sweeps: of the fit.
+    """
+
+    name: ClassVar[str] = "series"
+    label: ClassVar[str] = "Volumes in time"
+    traits: ClassVar[Traits] = Traits(in_time=True)
+
+    volumes: int = 2
+    moves: bool | None = None
+    sweeps: int = 60
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        if problem.grid != Grid.matching(problem.geometry):
+            raise ValueError("volumes in time have the grid of the views: leave out another one")
+        n, times = problem.geometry.n_views, problem.use.times
+        times = np.arange(n, dtype=np.float64) if times is None else times
+        history = _History(self.sweeps, n, control)
+        made = fit_series(
+            _measured(problem, times), self.volumes, motion=self.moves, sweeps=self.sweeps, seed=problem.seed,
+            go_on=history.heard, stop=control.should_stop or (lambda: False),
+        )  # fmt: skip
+        moves, settings = made.motion is not None, {"view_seconds": times - times.min()}
+        chosen = {} if made.unseen_residuals is None else {"chosen_because": _because(*made.unseen_residuals, moves)}
+        smooth = {} if made.smooth is None else {"smooth": made.smooth}
+        series = VolumesInTime(
+            made.times - times.min(), np.stack([made.at(time) for time in made.times]), made.residual
+        )  # fmt: skip
+        return Reconstruction(
+            Volume(series.data[0], made.grid),
+            {"volumes": self.volumes, "moves": moves, "sweeps": self.sweeps, **settings, **smooth, **chosen},
+            history.of_sweeps, series=series,
+        )  # fmt: skip
+
+    def toy(self) -> Self:
+        return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
+        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * rays
+
+
+@dataclass
+class _History:
+    """Progress of a series: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
+
+    sweeps: int
+    n_views: int
+    control: RunControl
+    of_sweeps: tuple[Progress, ...] = ()
+    tried: int = 0
+
+    def __post_init__(self) -> None:
+        self.began = self.control.now()
+
+    def heard(self, sweep: int, residual: float) -> bool:
+        """As `fit_series` calls its `go_on`."""
+        seconds = self.control.now() - self.began
+        if sweep > 0:
+            now = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
+            self.of_sweeps = (*self.of_sweeps, now)
+        else:
+            self.tried += 1
+            steps = self.tried - sweep
+            now = Progress(self.tried, steps, seconds, math.nan, math.nan, 0, self.n_views, unit="trial sweeps")
+            self.tried = 0 if sweep == 0 else self.tried
+        if self.control.on_progress is not None:
+            self.control.on_progress(now)
+        return self.control.should_stop is None or not self.control.should_stop()
+
+
+def _measured(problem: ReconProblem, times: F64) -> TimedViews:
+    """The views, 0 and without weight where nothing was measured."""
+    data, weights = problem.projections, problem.use.weights
+    if not (finite := np.isfinite(data)).all():
+        weights = finite.astype(np.float32) if weights is None else weights * finite
+    if weights is not None:
+        data = np.where(weights > 0, data, np.float32(0))
+    return TimedViews(data, problem.geometry, times, weights)
+
+
+def _because(still: float, moved: float, moves: bool) -> str:
+    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    if moves or moved >= still:
+        return f"{'motion' if moves else 'no motion'}, as {judged}"
+    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"

@@ -14,9 +14,12 @@ from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
+from recon.base.method import Method, volumes_of
 from recon.base.slabs import slabs_of
 from recon.base.volume import Grid
 from recon.run_time import Extent, RunTime, run_seconds
+from recon.series import Series
+from recon.series_time import series_seconds
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class Estimate:
     """The resources of a reconstruction.
 
     Attributes:
-        shape: of the volume [z, y, x].
+        shape: of the volume [z, y, x], or of volumes in time [time, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
         memory: bytes that will be used.
@@ -33,12 +36,12 @@ class Estimate:
         scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
         output, free: bytes of the result, and bytes on its disk.
         seconds: at most, without reading and correction.
-        least_seconds: where the data end a fit as early as they may; otherwise `seconds`.
+        least_seconds: where the data shorten the work as much as they may; otherwise `seconds`.
     """
 
     method: str
     views: int
-    shape: tuple[int, int, int]
+    shape: tuple[int, ...]
     at_once: int
     allowed: int
     memory: int
@@ -56,10 +59,12 @@ class Estimate:
             in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
         time = f"about {duration_text(self.seconds)}"
         if self.least_seconds < self.seconds:
-            time = f"at most {time}; about {duration_text(self.least_seconds)} where the data end the fit early"
+            time = f"at most {time}; about {duration_text(self.least_seconds)} where the data shorten it"
         how = in_slabs if self.scratch else "all at once"
+        *several, z, y, x = self.shape
+        what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
         return [
-            f"{'volume':<10}{' x '.join(str(n) for n in self.shape)} voxels by {self.method}, from {self.views} views",
+            f"{what}{z} x {y} x {x} voxels by {self.method}, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
             f"{'time':<10}{time}, reading and correction not counted",
@@ -84,7 +89,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         shape = Grid.matching(geometry).shape
         slabs = missing = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
-        if not fits and geometry.is_cone:
+        if not fits and geometry.is_cone and not options.method.traits.in_time:
             raise DataError(
                 f"{source.path}: {options.method.name} would take {size(needs.at_once)}, {size(allowed)} of memory may "
                 "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
@@ -110,14 +115,21 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     heights = [slab.slices.stop - slab.slices.start for slab in missing]
     extent = Extent(geometry, heights, decided=options.partial is not None)
     try:
-        seconds = run_seconds(needs.method, extent, clock.now) if missing else RunTime(0.0, 0.0)
+        seconds = _seconds(needs.method, extent, clock) if missing else RunTime(0.0, 0.0)
     except ValueError as error:  # as the method itself refuses the views
         raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
     most, least = (each * (1 + options.uncertainty) for each in seconds)  # error bars take at most as long
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
     height = slabs[0].own.stop
+    of_all = shape if (several := volumes_of(needs.method)) == 1 else (several, *shape)
     return Estimate(
-        options.method.name, geometry.n_views, shape, needs.at_once, allowed,
+        options.method.name, geometry.n_views, of_all, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
         most, least,
     )  # fmt: skip
+
+
+def _seconds(method: Method, extent: Extent, clock: Clock) -> RunTime:
+    if isinstance(method, Series):
+        return series_seconds(extent.geometry, method.volumes, method.moves, method.sweeps, clock.now)
+    return run_seconds(method, extent, clock.now)
