@@ -183,8 +183,7 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
         retaken=tuple(sorted(again)),
         references=tuple(group.described() for group in groups if group.faults),
         altered=altered_said(source) if source.altered else "",
-        aside=tuple(failure for each in judged for failure in each.failures)
-        + (judged[-1].aside.said() if judged else ()),
+        aside=failures + (judged[-1].aside.said() if judged else ()),
         drift=judged[-1].drift if judged else "",
     )
 
