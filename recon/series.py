@@ -277,6 +277,7 @@ class Series:
         volumes: 2 or more, from the first view to the last; each needs twelve views or more.
         moves: matter moves, and not only its density changes; None: what views held out prefer.
         sweeps: of the fit.
+        weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
     """
 
     name: ClassVar[str] = "series"
@@ -286,6 +287,7 @@ class Series:
     volumes: int = 2
     moves: bool | None = None
     sweeps: int = 60
+    weight: float | None = None
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if problem.grid != Grid.matching(problem.geometry):
@@ -294,20 +296,23 @@ class Series:
         times = np.arange(n, dtype=np.float64) if times is None else times
         history = _History(self.sweeps, n, control)
         made = fit_series(
-            _measured(problem, times), self.volumes, motion=self.moves, sweeps=self.sweeps, seed=problem.seed,
-            go_on=history.heard, stop=control.should_stop or (lambda: False),
-        )  # fmt: skip
-        moves, settings = made.motion is not None, {"view_seconds": times - times.min()}
-        chosen = {} if made.unseen_residuals is None else {"chosen_because": _because(*made.unseen_residuals, moves)}
-        smooth = {} if made.smooth is None else {"smooth": made.smooth}
-        series = VolumesInTime(
-            made.times - times.min(), np.stack([made.at(time) for time in made.times]), made.residual
-        )  # fmt: skip
-        return Reconstruction(
-            Volume(series.data[0], made.grid),
-            {"volumes": self.volumes, "moves": moves, "sweeps": self.sweeps, **settings, **smooth, **chosen},
-            history.of_sweeps, series=series,
-        )  # fmt: skip
+            _measured(problem, times),
+            self.volumes,
+            motion=self.moves,
+            tv_weight=self.weight,
+            sweeps=self.sweeps,
+            seed=problem.seed,
+            go_on=history.heard,
+            stop=control.should_stop or (lambda: False),
+        )
+        series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
+        settings = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
+        settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
+        if made.unseen_residuals is not None:
+            settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
+        if not history.of_sweeps:  # it was stopped before
+            history.tell(0, made.residual)
+        return Reconstruction(Volume(series.data[0], made.grid), settings, history.of_sweeps, series=series)
 
     def toy(self) -> Self:
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
@@ -332,18 +337,25 @@ class _History:
 
     def heard(self, sweep: int, residual: float) -> bool:
         """As `fit_series` calls its `go_on`."""
-        seconds = self.control.now() - self.began
         if sweep > 0:
-            now = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
-            self.of_sweeps = (*self.of_sweeps, now)
+            self.tell(sweep, residual)
         else:
             self.tried += 1
-            steps = self.tried - sweep
-            now = Progress(self.tried, steps, seconds, math.nan, math.nan, 0, self.n_views, unit="trial sweeps")
+            self._tell(
+                Progress(self.tried, self.tried - sweep, math.nan, math.nan, math.nan, 0, 0, unit="trial sweeps")
+            )
             self.tried = 0 if sweep == 0 else self.tried
+        return self.control.should_stop is None or not self.control.should_stop()
+
+    def tell(self, sweep: int, residual: float) -> None:
+        """Of a sweep of the fit."""
+        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
+
+    def _tell(self, reached: Progress) -> Progress:
+        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
         if self.control.on_progress is not None:
             self.control.on_progress(now)
-        return self.control.should_stop is None or not self.control.should_stop()
+        return now
 
 
 def _measured(problem: ReconProblem, times: F64) -> TimedViews:
