@@ -47,7 +47,7 @@ REGISTRY: dict[str, MethodEntry] = {
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
     "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
-    "series": MethodEntry("recon.series", "Series", compared=False),
+    "series": MethodEntry("recon.series", "TimeSeries", compared=False),
     "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
     "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
     "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),

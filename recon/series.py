@@ -270,7 +270,7 @@ def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F
 
 
 @dataclass(frozen=True)
-class Series:
+class TimeSeries:
     """Volumes at even times of one scan of a sample that changes, see `fit_series`.
 
     Attributes:

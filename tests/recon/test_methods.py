@@ -145,6 +145,6 @@ class TestConformance(MethodConformance):
             request.getfixturevalue("one_thread")
             return methods.build(method, FIELDS[request.param])
         if request.param == methods.IN_TIME:
-            return recon.Series(moves=False, sweeps=5, weight=0.01)
+            return recon.TimeSeries(moves=False, sweeps=5, weight=0.01)
         short = {"iterations": 5, "steps": 40, "gaussians": 200, "finish": 2}
         return methods.build(method, {k: v for k, v in short.items() if methods.has_setting(method, k)})

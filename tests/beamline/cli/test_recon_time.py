@@ -98,7 +98,7 @@ def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path:
 
 
 def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: Path, tmp_path: Path) -> None:
-    method, wanted = recon.Series(volumes=2, moves=False, sweeps=30), Selection(axis_col=19.5)
+    method, wanted = recon.TimeSeries(volumes=2, moves=False, sweeps=30), Selection(axis_col=19.5)
     held = api.reconstruct(scan, method, selection=wanted, say=None)
     assert held.output is None and held.report is None and not held.parameters["moves"] and held.units == "1/mm"
     assert held.seconds_of_volumes == pytest.approx((0, SPAN)) and held.axis_col == 19.5
@@ -111,7 +111,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: P
     np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
     assert not kept.ended_early
     with pytest.raises(api.DataError, match="12 views or more for each"):
-        api.reconstruct(scan, recon.Series(volumes=4), selection=wanted, say=None)
+        api.reconstruct(scan, recon.TimeSeries(volumes=4), selection=wanted, say=None)
     for output, more in (("other.tif", {}), ("other.h5", {"rows": (0, 1), "views": "fixed:12"})):
         with pytest.raises((api.ConfigError, api.DataError)):
             api.reconstruct(scan, method, output=tmp_path / output, say=None, **more)
