@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import reconstruct
     from recon.registration import register_energies
-    from recon.series import TimeSeries, TimedViews, TimedVolumes, fit_series
+    from recon.series import TimedViews, TimedVolumes, TimeSeries, fit_series
     from recon.share_fit import fit_share
     from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
@@ -91,9 +91,9 @@ __all__ = [
     "RunControl",
     "Sart",
     "SaxNerf",
-    "TimeSeries",
     "Sirt",
     "StreamingFit",
+    "TimeSeries",
     "TimedViews",
     "TimedVolumes",
     "Volume",

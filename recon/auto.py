@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -13,14 +12,20 @@ from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import ChoosingMethod, Method, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import ChoosingMethod, Method, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import CostedMethod, Costs, Work
+from recon.splatting.finish import Candidates
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
-from recon.trials import of_views, part_of, predicts_best
+from recon.splatting.train import trials_of
+from recon.trials import ROWS, of_views, part_of, predicts_best
 from recon.voxels.direct import Fbp
+from recon.voxels.held_out import TRIAL_ROWS
 from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct, prior_of
+from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.work import trial_part
 
 
 def _candidates() -> tuple[Method, ...]:
@@ -31,8 +36,9 @@ def _candidates() -> tuple[Method, ...]:
 class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
-    The part is a slab of 32 rows where most matter is. A cone's part is the rows in its middle, or all rows at half the
-    resolution. One of eight views is held out. The method that leaves least of these is taken. There is no trial with
+    The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
+    and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
+    settings of their own, each is run on 32 rows, or on all of them at half the resolution. There is no trial with
     fewer than 16 views, or of a sample wider than the field: the last one takes these. docs/choosing.md has reasons.
 
     Attributes:
@@ -66,8 +72,7 @@ class Auto:
     def choose(self, problem: ReconProblem, control: RunControl, decide: Decisions) -> tuple[int, str, bool]:
         """Number of the chosen method, the reason, and whether there were trials.
 
-        The prior is sought once, on the whole, and `decide` takes it for the chosen method. (From the part's fewer
-        views it costs 0.4 dB on a walnut.)
+        Methods that views held out judge in one trial, as `r2` does, are not run for it. `decide` takes its prior.
         """
         last = len(self.candidates) - 1
         wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
@@ -75,21 +80,50 @@ class Auto:
             name = self.candidates[wider[0]].name
             why = "views do not fall to zero at their edges, as of a sample wider than the field"
             return wider[0], f"{why}, and only {name} models what is beyond it", False
+        fit = self._fit
+        if fit is not None:
+            listen = control.on_progress if control.decide is None else None  # in a slab only slices are counted
+            tried = trials_of(fit, problem, replace(control, on_progress=listen))
+            residuals = [_residual(method, tried) for method in self.candidates]
+            if min(residuals) < math.inf:
+                decide.preset(tried.prior)
+                named = zip(self.candidates, residuals, strict=True)
+                listed = "; ".join(f"{method.name} {each:.4g}" for method, each in named if each < math.inf)
+                rows = min(TRIAL_ROWS, problem.geometry.detector_shape[0])
+                return int(np.argmin(residuals)), f"residual of views held out, {rows} rows: {listed}", True
         part, where = part_of(problem)
         if part is None:
             return last, where, False
-        prior: Mapping[str, Sequence[Any]] = {}
-        same_pixels = part.geometry.pixel_pitch == problem.geometry.pixel_pitch
-        if same_pixels and any(isinstance(method, PnpDct) for method in self.candidates):
-            prior = prior_of(problem, _trial_of_prior(control, problem.geometry.n_views))
-        at, residuals = predicts_best(part, self.candidates, control, prior=prior)
+        at, because = predicts_best(part, self.candidates, control)
         if at is None:
-            return last, residuals, False
-        decide.preset(prior)
-        return at, f"residual of views held out, {where}: {residuals}", True
+            return last, because, False
+        return at, f"residual of views held out, {where}: {because}", True
+
+    @property
+    def _fit(self) -> FitMethod | None:
+        """The fit among the candidates, where one trial judges all of them; else None."""
+        *others, last = self.candidates
+        fits = last if isinstance(last, FitMethod) and last.by_content else None
+        return fits if all(_judged_beside(method) for method in others) else None
 
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        """Of the trial that judges all candidates, or of one of each; a sample wider than the field has none."""
+        methods = [
+            method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
+        ]
+        costed = [method for method in methods if isinstance(method, CostedMethod)]
+        part = trial_part(geometry, grid, ROWS)
+        if part is None:
+            return costed[-1].costs(geometry, grid)
+        volumes = {name: work for method in costed for name, work in method.costs(geometry, grid).volumes.items()}
+        fit = self._fit
+        if isinstance(fit, CostedMethod):
+            return Costs(volumes, fit.costs(geometry, grid).choice)
+        trials = [work for method in costed for work in method.costs(*part).volumes.values()]
+        return Costs(volumes, sum(trials, Work()))
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)
@@ -101,16 +135,14 @@ def is_wider(problem: ReconProblem) -> bool:
     return leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry)
 
 
-def _trial_of_prior(control: RunControl, n_views: int) -> Callable[[], bool]:
-    """Tells of each sweep of the trials of a prior, and asks whether to stop. In a slab only slices are counted."""
-    begin, done = control.now(), 0
+def _judged_beside(method: Method) -> bool:
+    """The trial of a fit judges this method, too."""
+    given = getattr(method, "tv_weight", None), getattr(method, "patch_threshold", None)
+    return isinstance(method, Fbp | FistaTv | PnpDct) and given == (None, None)
 
-    def on_trial() -> bool:
-        nonlocal done
-        done += 1
-        if control.on_progress is not None and control.decide is None:
-            seconds = control.now() - begin
-            control.on_progress(Progress(done, 0, seconds, math.nan, math.nan, 0, n_views, unit="sweeps of trials"))
-        return control.should_stop is not None and control.should_stop()
 
-    return on_trial
+def _residual(method: Method, tried: Candidates) -> float:
+    """Mean of what the method leaves of views held out; infinite where it was not tried."""
+    of_voxels = {Fbp: tried.direct, FistaTv: tried.smooth, PnpDct: tried.patches}
+    residuals = of_voxels.get(type(method), tried.fit)
+    return math.inf if residuals is None else float(residuals.mean())

@@ -1,118 +1,294 @@
-"""measured_speeds: the speed of this machine on a scan, from about a second of small runs, scaled to the whole."""
+"""Machine speed: how long each operation of `recon.base.work` takes here, from runs of some hundredths of a second.
+
+An operation is timed at two sizes, which tell its two rates. The least of some runs counts, since others may use the
+machine, too. All operations of a method take a fraction of a second together, but for compiling them.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import NamedTuple
 
-from recon.assess.plans import Speeds
+import numpy as np
+
 from recon.base.arrays import F32
-from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, RunControl
-from recon.base.volume import Grid
+from recon.base.method import Clock
+from recon.base.volume import Grid, Volume
+from recon.base.work import Rate
+from recon.energy_fit import EnergyFit
+from recon.fields.train import FieldMethod
+from recon.kernels.cpu import tv as tv_cpu
+from recon.kernels.cpu.patches import denoise, patch_scratch
+from recon.kernels.cpu.vectors import add_product
+from recon.methods import by_name, with_settings
 from recon.reconstruction import reconstruct
+from recon.series import MOMENTS, TimedViews, of_moments
+from recon.splatting import optimise
+from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.in_time import sweep_seconds
-from recon.splatting.initialise import MATTER, count_for, density_unit, first_volume, sample_gaussians
-from recon.splatting.r2 import R2
+from recon.splatting.initialise import count_for, sample_gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import busiest_rows, choice_sweeps
+from recon.splatting.work import covered
+from recon.voxels.direct import direct, direct_work
+from recon.voxels.motion import Motion
+from recon.voxels.projector import Projector
+from recon.voxels.sweeps import Sweeps
+from recon.voxels.tv import TotalVariationProx
 
-_SLAB_ROWS, _SLAB_VIEWS = 16, 16
-_COARSE_COLS, _COARSE_VIEWS = 64, 60
-_STEP_VIEWS, _STEPS = 4, 6
-_SWEPT_ROWS = 64  # fewer rows take longer for each row: 1.5 times at 16
+_TV_STEPS = 3
+_SERIAL = ("draw",)  # operations of one thread
+_RUNS = 3  # the least of which counts, after one that loads what it needs
 
 
-def measured_speeds(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
-    """Measure each part of a reconstruction on a part of the scan.
+class _Timed(NamedTuple):
+    """An operation of some size: the two amounts of its work, and what does it."""
 
-    The first volume (FBP, or its replacement, see `first_volume`), placing and filling run on a slab of rows. The step
-    runs on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a coarse
-    first volume: the time of a step depends on how much they overlap.
+    first: float
+    second: float
+    run: Callable[[], object]
+
+
+def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:
+    """The rate of an operation on this machine, where no other program runs.
+
+    Args:
+        operation: its name, as of `OPERATIONS`, with what follows a comma.
+        now: processor time of this process, all threads together: that is the same where others use the machine.
+        threads: that share it.
 
     Raises:
-        ValueError: the scan holds no matter.
+        KeyError: there is no such operation.
     """
-    field = Grid.for_fit(geometry, grid)
-    count = count_for(field, geometry.is_cone)
-    slab, part = _slab(projections, geometry)
-    slices = Grid.of_field(part, part.sample_pitch)
-    whole = field.shape[0] / slices.shape[0]
-    views = geometry.n_views / part.n_views
-    first_volume(slab, part, slices)  # starts threads and loads pages; not timed
-    begin = now()
-    first = first_volume(slab, part, slices)
-    fbp_seconds = (now() - begin) * whole * views
-
-    begin = now()
-    placed = sample_gaussians(
-        first, max(1, round(count / whole)), np.random.default_rng(0), field_radius=geometry.reach,
-        kernel=FitSettings().kernel,
-    )  # fmt: skip
-    start_seconds = (now() - begin) * whole
-    voxelize(placed, slices)
-    begin = now()
-    voxelize(placed, slices)
-    fill_seconds = (now() - begin) * grid.shape[0] / slices.shape[0]
-
-    step_seconds, view_seconds = _step(projections, geometry, grid, _spread_out(projections, geometry, count), now)
-    # Placing scales its densities by a projection of twelve views, which is about a third of as many steps.
-    start_seconds += 4 * step_seconds + view_seconds * geometry.n_views
-    high = geometry.rows(0, min(_SWEPT_ROWS, geometry.detector_shape[0]))
-    some = Grid.of_field(high, high.sample_pitch)
-    sweep = sweep_seconds(high, some, now) * grid.shape[0] / some.shape[0]
-    trials = choice_sweeps(geometry) * sweep
-    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep, trials)
+    kind, _, which = operation.partition(", ")
+    rate = _rate(OPERATIONS[kind](which), now)
+    return rate if kind in _SERIAL else Rate(rate.first / threads, rate.second / threads)
 
 
-def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
-    """A few views of the rows with most matter."""
-    views = _around(geometry, _SLAB_VIEWS)
-    some = projections[views]
-    rows = busiest_rows(some, _SLAB_ROWS)
-    return np.ascontiguousarray(some[:, rows]), geometry.select(views).rows(rows.start, rows.stop)
+def _rate(timed: tuple[_Timed, ...], now: Clock) -> Rate:
+    """By two sizes with rates of 0 or more: where one would be less, or of one size, the larger tells the other."""
+    seconds = []
+    for size in timed:
+        size.run()
+        times = []
+        for _ in range(_RUNS):
+            begin = now()
+            size.run()
+            times.append(now() - begin)
+        seconds.append(min(times))
+    (a, b, _), (c, d, _) = timed[0], timed[-1]
+    short, long = seconds[0], seconds[-1]
+    if (scale := a * d - b * c) != 0:
+        first, second = (short * d - long * b) / scale, (a * long - c * short) / scale
+        if first >= 0 and second >= 0:
+            return Rate(first, second)
+    return Rate(0.0, long / d) if d > 0 else Rate(long / c, 0.0)
 
 
-def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
-    """`count` Gaussians where a coarse first volume shows matter, with the widths of placed ones."""
-    factor = max(1, min(-(-geometry.detector_shape[1] // _COARSE_COLS), geometry.detector_shape[0]))
-    views = _around(geometry, _COARSE_VIEWS)
-    coarse = geometry.select(views).binned(factor)
-    grid = Grid.of_field(coarse, coarse.sample_pitch)
-    volume = first_volume(bin_views(projections[views], factor), coarse, grid)
-    unit = density_unit(volume)
-    cells = np.flatnonzero(volume.data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
-    if cells.size == 0:
-        raise ValueError("a coarse FBP shows no matter: are the projections line integrals (-log of the transmission)?")
-    rng = np.random.default_rng(0)
-    k, j, i = np.unravel_index(rng.choice(cells, count), grid.shape)
-    z, y, x = grid.coordinates()
-    means = np.stack((x[i], y[j], z[k]), 1) + (rng.random((count, 3)) - 0.5) * grid.spacing[::-1]
-    # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell with one point each.
-    distance = 0.75 * (cells.size * float(np.prod(grid.spacing)) / count) ** (1 / 3)
-    width = max(0.8 * distance, 0.5 * geometry.sample_pitch)
-    return Gaussians.from_physical(
-        means, np.full((count, 3), width), np.full(count, 0.5 * unit), density_unit=unit, kernel=FitSettings().kernel
+def _geometry(beam: str, rows: int, cols: int, views: int) -> Geometry:
+    angles = np.linspace(0, np.pi, views, endpoint=False)
+    if beam == "cone":
+        return Geometry.cone(2 * angles, (rows, cols), 1.0, 4 * cols, 8 * cols)
+    return Geometry.parallel(angles, (rows, cols), tilt=0.05 if beam == "posed" else 0.0)
+
+
+def _sweeps(beam: str, single: bool = False) -> tuple[_Timed, ...]:
+    several = ((2, 256), (64, 192)) if single else ((8, 160), (96, 192))
+    sizes = ((1, 96), (1, 512)) if beam == "slice" else several
+    return tuple(_swept(beam, *size, single) for size in sizes)
+
+
+def _swept(beam: str, rows: int, cols: int, single: bool) -> _Timed:
+    """Lines and voxels of a few views, together or one by one."""
+    geometry = _geometry(beam, rows, cols, 4 if single or beam == "posed" else 16)
+    grid = Grid.matching(geometry)
+    nz, ny, nx = grid.shape
+    projector, x = Projector(geometry, grid), np.ones((ny, nx, nz), np.float32)
+    lines = float(geometry.n_views * ny * nx)
+    if not single:
+        return _Timed(lines, lines * nz, lambda: projector.adjoint_lines(projector.forward_lines(x), x))
+    sweeps = Sweeps(projector, projector.forward_lines(x), None, list(np.arange(geometry.n_views)[:, None]))
+    return _Timed(lines, lines * nz, lambda: sweeps.run(x, 1.0, True, None))
+
+
+def _on_volume(make: Callable[[tuple[int, int, int]], Callable[[], object]], times: int = 1) -> tuple[_Timed, ...]:
+    """Lines and voxels of a volume that is passed so many times."""
+    return tuple(
+        _Timed(float(times * a * b), float(times * a * b * c), make((a, b, c)))
+        for a, b, c in ((160, 160, 8), (192, 192, 96))
     )
 
 
-def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians, now: Clock) -> tuple[float, float]:
-    """(s a step, s for each view before the first step), from a short fit's own record."""
-    views = _around(geometry, _STEP_VIEWS)
-    point = Grid((1, 1, 1), grid.voxel_size)  # filling a volume is measured elsewhere
-    fit = R2(steps=_STEPS, gaussians=gaussians, fit=FitSettings(policy=None))
-    data = np.ascontiguousarray(projections[views])
-    result = reconstruct(data, geometry.select(views), fit, grid=point, control=RunControl(now=now))
-    first, last = result.history[0], result.history[-1]
-    step = (last.seconds - first.seconds) / max(1, last.step - first.step)
-    return step, max(0.0, first.seconds - step) / len(views)
+def _noise(shape: tuple[int, ...]) -> F32:
+    return np.random.default_rng(0).random(shape, np.float32)
 
 
-def _around(geometry: Geometry, most: int) -> NDArray[np.int64]:
-    """Some views from all around, so that they need the same kind of first volume as all views."""
-    n = geometry.n_views
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    return np.sort(order[np.arange(min(n, most)) * n // min(n, most)])
+def _passed(shape: tuple[int, int, int]) -> Callable[[], object]:
+    x, y, z = _noise(shape), _noise(shape), _noise(shape)
+    return lambda: add_product(x, 1e-3, y, z, True)
+
+
+def _smoothed(shape: tuple[int, int, int]) -> Callable[[], object]:
+    prox, x = TotalVariationProx(shape, (1.0, 1.0, 1.0), True, _TV_STEPS), _noise(shape)
+    return lambda: prox(x, 1e-2)
+
+
+def _sloped(shape: tuple[int, int, int]) -> Callable[[], object]:
+    x, out = _noise(shape), _noise(shape)
+    return lambda: tv_cpu.gradient(x, 1e-4, (1.0, 1.0, 1.0), out)
+
+
+def _patched(shape: tuple[int, int, int]) -> Callable[[], object]:
+    x, scratch, out = _noise(shape), patch_scratch(shape), _noise(shape)
+    return lambda: denoise(x, 0.1, True, scratch, out)
+
+
+_FBP = {  # rows, columns and views for which FBP takes either way
+    "rays": ((48, 96, 60), (16, 320, 60)),
+    "gridding": ((16, 512, 180),),
+}
+
+
+def _filtered(which: str) -> tuple[_Timed, ...]:
+    return tuple(
+        _Timed(*direct_work(geometry, grid).amounts[f"fbp, {which}"], partial(direct, data, geometry, grid, "hann"))
+        for geometry, grid, data in (_lines("parallel", *size) for size in _FBP[which])
+    )
+
+
+def _back_projected(which: str) -> tuple[_Timed, ...]:
+    return tuple(
+        _Timed(
+            *direct_work(geometry, grid).amounts[f"back-projection, {which}"],
+            partial(direct, data, geometry, grid, "hann"),
+        )
+        for geometry, grid, data in (_lines(which, rows, cols, 12) for rows, cols in ((8, 96), (32, 128)))
+    )
+
+
+def _lines(beam: str, rows: int, cols: int, views: int) -> tuple[Geometry, Grid, F32]:
+    """Views of a disc with a hole, and the grid that matches them."""
+    geometry = _geometry(beam, rows, cols, views)
+    grid = Grid.matching(geometry)
+    width = cols * grid.voxel_size
+    _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = (np.hypot(x, y) < 0.4 * width) & ~(np.hypot(x - 0.1 * width, y) < 0.1 * width)
+    return geometry, grid, Projector(geometry, grid).forward((disc / width).astype(np.float32))
+
+
+def _fitted(beam: str) -> tuple[_Timed, ...]:
+    return _steps(beam, 16, 96), _steps(beam, 48, 128)
+
+
+def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> _Timed:
+    """Views of some steps of a fit, and what its Gaussians cover in them."""
+    geometry, grid, data = _lines(beam, rows, cols, 12)
+    settings = FitSettings(policy=None)
+    gaussians = _drawn(geometry, grid)
+    state = optimise.init(gaussians, 0)
+    problem = optimise.problem_of(data, geometry, grid, state.unit, settings)
+    views = steps * settings.views_per_step
+
+    def run() -> None:
+        for _ in range(steps):
+            optimise.step(state, problem, settings, 0.0)
+
+    return _Timed(views, views * covered(math.prod(grid.shape), gaussians.n), run)
+
+
+def _normalised(which: str) -> tuple[_Timed, ...]:
+    return _made_problem(16, 96), _made_problem(64, 160)
+
+
+def _made_problem(rows: int, cols: int) -> _Timed:
+    geometry, grid, data = _lines("parallel", rows, cols, 12)
+    return _Timed(
+        geometry.n_views,
+        data.size,
+        lambda: optimise.problem_of(data, geometry, grid, 1.0, FitSettings(), backend_for("cpu")),
+    )
+
+
+def _matter(grid: Grid) -> Volume:
+    width = grid.shape[2] * grid.voxel_size
+    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
+    disc = (np.hypot(x, y) < 0.4 * width) & ~(np.hypot(x - 0.1 * width, y) < 0.1 * width)
+    return Volume((disc / width + 0 * z).astype(np.float32), grid)
+
+
+def _drawn(geometry: Geometry, grid: Grid) -> Gaussians:
+    return sample_gaussians(
+        _matter(grid), count_for(grid, geometry.is_cone), np.random.default_rng(0), field_radius=math.inf,
+        kernel=FitSettings().kernel,
+    )  # fmt: skip
+
+
+def _draws(which: str) -> tuple[_Timed, ...]:
+    return _draw(8, 64), _draw(32, 128)
+
+
+def _draw(rows: int, cols: int) -> _Timed:
+    grid = Grid((rows, cols, cols))
+    geometry = _geometry("parallel", rows, cols, 12)
+    return _Timed(count_for(grid, False), math.prod(grid.shape), partial(_drawn, geometry, grid))
+
+
+def _fills(which: str) -> tuple[_Timed, ...]:
+    return _fill(8, 64), _fill(32, 128)
+
+
+def _fill(rows: int, cols: int) -> _Timed:
+    grid = Grid((rows, cols, cols))
+    gaussians = _drawn(_geometry("parallel", rows, cols, 12), grid)
+    return _Timed(gaussians.n, math.prod(grid.shape), partial(voxelize, gaussians, grid))
+
+
+def _fields(which: str) -> tuple[_Timed, ...]:
+    geometry, grid, data = _lines("parallel", 8, 64, 24)
+    method = by_name(which)()
+    assert isinstance(method, FieldMethod)
+    samples, voxels = method.rays * method.samples_of(64), math.prod(grid.shape)
+
+    def run(steps: int) -> object:
+        return reconstruct(data, geometry, with_settings(method, {"steps": steps}))
+
+    return tuple(_Timed(steps * samples, voxels, partial(run, steps)) for steps in (1, 4))
+
+
+def _series(which: str) -> tuple[_Timed, ...]:
+    how, knots = which.split()
+    return _serial(int(knots), how == "moving", 32), _serial(int(knots), how == "moving", 80)
+
+
+def _serial(knots: int, moves: bool, cols: int) -> _Timed:
+    """Views, and voxels x views, of sweeps of a fit of volumes in time."""
+    geometry, _, data = _lines("parallel", 16, cols, 12 * knots)
+    grid, times = Grid.matching(geometry), np.arange(geometry.n_views, dtype=np.float64)
+    views, past = of_moments(TimedViews(data, geometry, times), np.linspace(0, times[-1], knots), MOMENTS * (knots - 1))
+    nz, ny, nx = grid.shape
+    fit = EnergyFit(views, grid, np.random.default_rng(0), Motion.none((ny, nx, nz), past, 3, 3) if moves else None)
+    n = float(geometry.n_views)
+    return _Timed(n, n * nz * ny * nx, lambda: list(fit.sweeps(np.full(knots, 0.1), 1)))
+
+
+OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
+    "sweep": _sweeps,  # a projection and its adjoint: lines x views, voxels x views; of a kind of beam
+    "single sweep": partial(_sweeps, single=True),  # the same, with a correction of the volume after each view
+    "pass": lambda which: _on_volume(_passed),  # sums of volumes: lines, voxels
+    "tv": lambda which: _on_volume(
+        _smoothed, _TV_STEPS + 1
+    ),  # a dual step of total variation, or the end of some: lines, voxels
+    "slope": lambda which: _on_volume(_sloped),  # of total variation: lines, voxels
+    "patches": lambda which: _on_volume(_patched),  # lines, voxels
+    "fbp": _filtered,  # rays, s on the machine of docs/notes/performance.md; by rays or by gridding
+    "back-projection": _back_projected,  # lines x views, voxels x views; of a cone or of views in any pose
+    "views": _normalised,  # the data of a fit: views, rays
+    "view": _fitted,  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
+    "draw": _draws,  # first Gaussians: Gaussians, voxels
+    "fill": _fills,  # the volume of Gaussians: Gaussians, voxels
+    "series": _series,  # sweeps of volumes in time: views, voxels x views; of a sample at rest or moving, and volumes
+    "field": _fields,  # steps of a neural field: samples, voxels of its volume; of a method
+}

@@ -65,6 +65,11 @@ def names() -> tuple[str, ...]:
     return tuple(_entries())
 
 
+def names_of_one_volume() -> tuple[str, ...]:
+    """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
+    return tuple(name for name in names() if name != IN_TIME)
+
+
 def names_compared(emission: bool = False) -> tuple[str, ...]:
     """Names of the methods that a trade-off tries by default, more where the sample emits; loads no module of ours."""
     return tuple(name for name, entry in REGISTRY.items() if entry.compared or (emission and entry.emission))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +19,9 @@ from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import OfMoments, learnt_motion, unseen_squares
+from recon.learnt_motion import JUDGED, JUDGED_SWEEPS, SWEEPS_OF_TURN, OfMoments, learnt_motion, levels, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
 from recon.voxels.held_out import ONE_IN, beyond_chance, busiest_rows, slab_of
@@ -32,6 +33,10 @@ _MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in tim
 _SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
 _LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
+_TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24 * 16 at most
+_TURN = 4  # sweeps that the steps of a motion take, beside its own
+_FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
+SWEEPS = 60
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the series; for displacements and what they displace
 _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
@@ -115,7 +120,7 @@ def fit_series(
     *,
     motion: bool | None = None,
     tv_weight: float | None = None,
-    sweeps: int = 60,
+    sweeps: int = SWEEPS,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
@@ -255,6 +260,32 @@ def refuse_few(knots: int, n: int) -> None:
         )
 
 
+def series_costs(geometry: Geometry, knots: int, motion: bool | None, sweeps: int = SWEEPS) -> Costs:
+    """The work of `fit_series`: of a sample at rest, and of one that moves, where these are open.
+
+    Raises:
+        ValueError: the views do not suffice for so many volumes.
+    """
+    refuse_few(knots, geometry.n_views)
+    cols, grid = geometry.detector_shape[1], Grid.matching(geometry)
+    voxels = math.prod(grid.shape)
+    few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
+
+    def swept(moves: bool, sweeps: float, share: float = 1.0) -> Work:
+        views = sweeps * geometry.n_views
+        return Work.of(f"series, {'moving' if moves else 'still'} {knots}", views, views * share * voxels)
+
+    learning = sum((swept(True, n * (SWEEPS_OF_TURN + _TURN), wide**-3) for wide, n in levels(cols)), Work())
+    rest = swept(False, sweeps + _FACTORS[1]) + swept(False, sweeps + _FACTORS[0], few)
+    volumes = {"rest": rest, "moving": learning + swept(True, sweeps)}
+    choice = swept(False, _TRIALS, few)
+    if motion is not None:
+        return Costs({"moving" if motion else "rest": volumes["moving" if motion else "rest"]}, choice)
+    coarse = max(1, round(cols / JUDGED)) ** -3
+    judging = learning + swept(False, JUDGED_SWEEPS, coarse) + swept(True, JUDGED_SWEEPS, coarse)
+    return Costs(volumes, choice + judging)
+
+
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
     """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
     n = views.geometry.n_views
@@ -286,7 +317,7 @@ class TimeSeries:
 
     volumes: int = 2
     moves: bool | None = None
-    sweeps: int = 60
+    sweeps: int = SWEEPS
     weight: float | None = None
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -306,7 +337,7 @@ class TimeSeries:
             stop=control.should_stop or (lambda: False),
         )
         series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
-        settings = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
+        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
         settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
         if made.unseen_residuals is not None:
             settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
@@ -316,6 +347,9 @@ class TimeSeries:
 
     def toy(self) -> Self:
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -45,20 +45,18 @@ def predicts_best(
     methods: Sequence[Method],
     control: RunControl,
     order: Sequence[int] | None = None,
-    prior: Mapping[str, Sequence[Any]] | None = None,
 ) -> TrialsVerdict:
     """Which of the methods leaves least of unseen views (one of eight is held out); of equal ones the first.
 
     A simpler one within one standard error is not preferred, as it is among priors: on a shell of 50 views that costs
     1.7 dB, and the user would get a volume that predicts worse than another one that was tried.
 
-    A prior that one trial chooses by views held out is that of the next ones, unless `prior` is given. A method that
-    `control` cuts short is not judged.
+    A prior that one trial chooses by views held out is that of the next ones. A method that `control` cuts short is not
+    judged.
 
     Args:
         methods: the simplest and cheapest first.
         order: in which they are tried; None: the same.
-        prior: decisions on it, which all trials follow.
 
     Raises:
         ValueError: no method takes these views or data.
@@ -67,7 +65,7 @@ def predicts_best(
     trial, judge = (of_views(part, views) for views in split_views(part.geometry))
     residuals: dict[int, F64] = {}
     refused: list[str] = []
-    decided = dict(prior or {})
+    decided: dict[str, Sequence[Any]] = {}
 
     def stopped() -> bool:
         return control.should_stop is not None and control.should_stop()

@@ -38,7 +38,7 @@ from beamline.scan.run_folder import SCAN, create_run_folder
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
-from drivers.base.protocols import CameraSettings, TriggerSource
+from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource
 
 PATIENCE = 5.0
 """s beyond the exposure after which a frame that the detector triggered is lost."""
@@ -151,12 +151,14 @@ class _Frames(DetectorAcquireLogic):
                 angle = math.nan
                 if by_software:
                     angle = math.nan if devices.stage.moving() else devices.stage.position()
-                    self._clock.sleep(triggered + period - self._clock.now())
-                    camera.software_trigger()
-                    triggered = self._clock.now()
-                while (found := self._next(by_software)) is None:
+                    while (left := triggered + period - self._clock.now()) > 0 and not self._stop.is_set():
+                        self._clock.sleep(min(left, LOOK_EVERY))
                     if self._stop.is_set():
                         return
+                    camera.software_trigger()
+                    triggered = self._clock.now()
+                if (found := self._next(exposure + PATIENCE if by_software else math.inf)) is None:
+                    return
                 if found.framestamp != i:
                     raise InstrumentError(
                         f"{camera.name}: frame {found.framestamp} came, and {i} was expected: frames are lost. Take "
@@ -170,14 +172,17 @@ class _Frames(DetectorAcquireLogic):
             self._lacking = range(writer.rows, self._lacking.stop)
             camera.disarm()
 
-    def _next(self, by_software: bool) -> Any:
-        """The next frame; None after LOOK_EVERY s without one, where pulses come by a cable."""
-        try:
-            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if by_software else LOOK_EVERY)
-        except DeviceTimeout:
-            if by_software:
-                raise
-            return None
+    def _next(self, patience: float) -> CameraFrame | None:
+        """The next frame; None where the frames are to end. DeviceTimeout: none has come for so many s."""
+        waited = 0.0
+        while not self._stop.is_set():
+            try:
+                return self._devices.camera.next_frame(min(LOOK_EVERY, patience - waited))
+            except DeviceTimeout as error:
+                waited += LOOK_EVERY
+                if waited >= patience:
+                    raise error.told_by(error.device, f"sent no frame for {patience:g} s after its trigger") from error
+        return None
 
 
 class _Trigger(DetectorTriggerLogic):

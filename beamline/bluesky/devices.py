@@ -62,7 +62,7 @@ class TomoScan(Device):
     async def unstage(self) -> None:
         """A scan that still runs is stopped, as by `beamline stop`, and its file closed."""
         task, self._task = self._task, None
-        if task is not None and not task.done():
+        if task is None or not task.done():  # a kickoff may be about to begin one
             self._stop.stop("the plan ended")
         if task is not None:
             await asyncio.wait([task])
@@ -103,11 +103,11 @@ class TomoScan(Device):
         self._refuse_second()
         self._stop, self._folder = StopRequest(), None
         self._stream = await asyncio.to_thread(ScanStream, self._config, self.name)  # which reads files of angles
-        self._task = asyncio.create_task(asyncio.to_thread(self._scan))
-        while self._folder is None and not self._task.done():
+        self._task = task = asyncio.create_task(asyncio.to_thread(self._scan))
+        while self._folder is None and not task.done():
             await asyncio.sleep(POLL)
         if self._folder is None:
-            self._task.result()
+            task.result()
 
     @WatchableAsyncStatus.wrap
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:

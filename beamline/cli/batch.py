@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
+import json
+from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 
 import click
 
 from beamline.cli.options import dry_option, json_events, json_option
 from beamline.cli.terminal import events_shown
-from beamline.core.errors import DataError, ScanStopped
+from beamline.core.errors import BeamlineError, DataError, ScanStopped
 from beamline.core.events import Done
-from beamline.reconstruct.batch import TABLE, BatchOptions, planned_batch, run_batch
+from beamline.reconstruct.batch import TABLE, BatchOptions, Need, planned_batch, run_batch
 from drivers.base.clock import SystemClock
 
 
@@ -26,6 +30,21 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
             raise click.BadParameter(f"{name!r} is no file, and no pattern that any file matches")
         scans.update((scan_file(match.resolve()), None) for match in matches)
     return list(scans)
+
+
+def _needs_of(config: Path | None, scan: str) -> Need:
+    """What `beamline recon SCAN --dry-run` says."""
+    from beamline.cli.recon import recon  # the batch itself needs none of it
+
+    arguments = [scan, *([] if config is None else ["--config", str(config)]), "--dry-run", "--json"]
+    lines = io.StringIO()
+    try:
+        with redirect_stdout(lines):
+            recon.main(arguments, prog_name="beamline recon", standalone_mode=False)
+    except (BeamlineError, click.ClickException) as error:
+        return Need(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
+    told = json.loads(lines.getvalue().splitlines()[-1])
+    return Need(told["seconds"], told["memory"], told["output"] + told.get("scratch", 0))
 
 
 @click.command()
@@ -53,7 +72,7 @@ def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_js
     """
     options, clock = BatchOptions(scans, config, output), SystemClock()
     if dry:
-        planned = planned_batch(options)
+        planned = planned_batch(options, partial(_needs_of, config))
         with json_events(as_json) as sink:
             sink(Done(planned, time=clock.now()))
         if not as_json:

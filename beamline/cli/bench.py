@@ -14,11 +14,12 @@ from beamline.cli.options import POSITIVE, json_events, json_option, parsed
 from beamline.cli.terminal import events_shown
 from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line
+from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from drivers import orca_quest
 from drivers.base.clock import SystemClock
 from recon.base.choices import N_GAUSSIANS, SIDE
-from recon.methods import by_name, names
+from recon.methods import by_name, names_of_one_volume
 
 if TYPE_CHECKING:
     from beamline.doctor.rate import Load, RateRow
@@ -82,9 +83,9 @@ def acquire(
         began = clock.now()
 
         def progress(n: int, of: int, stage: str) -> None:
-            per_min = 60 * n / max(clock.now() - began, 1e-9)
-            seconds_left = (of - n) * 60 / per_min if n else None
-            sink(TrialReached("bench", n, of, stage, seconds_left, per_min, time=clock.now()))
+            spent = clock.now() - began
+            per_min = 60 * n / max(spent, 1e-9)
+            sink(TrialReached("bench", n, of, stage, seconds_left(n, of, spent), per_min, time=clock.now()))
 
         for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)
@@ -182,7 +183,7 @@ def _rows() -> Iterator[VolumeRow]:
     from recon.bench import volume_rows
     from recon.splatting.r2 import R2
 
-    others = [by_name(name) for name in names()]
+    others = [by_name(name) for name in names_of_one_volume()]
     yield from volume_rows(time.perf_counter, [*map(R2, _STEPS), *(method() for method in others if method is not R2)])
 
 

@@ -50,13 +50,14 @@ class Outputs:
     """Puts `sys.stdout` and `sys.stderr` on files that last. Both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
+    Only `sys.stdout` leads to the results: what a library or a plug-in writes to the descriptor 1 goes to stderr.
     """
 
     def __init__(self) -> None:
         while (number := os.open(os.devnull, os.O_RDWR)) < 3:
             os.set_inheritable(number, True)
         os.close(number)
-        sys.stdout = _lasting(sys.stdout) or _nowhere()
+        sys.stdout = _lasting(sys.stdout, apart=True) or _nowhere()
         sys.stderr = _lasting(sys.stderr) or _nowhere()
 
     def lost(self) -> str:
@@ -68,14 +69,22 @@ class Outputs:
         return "" if error is None or error.errno in _CLOSED else error.strerror
 
 
-def _lasting(stream: TextIO | None) -> TextIO | None:
-    """The same stream without errors; the stream itself if the system has no file for it (console of Windows)."""
+def _lasting(stream: TextIO | None, apart: bool = False) -> TextIO | None:
+    """The same stream without errors; the stream itself if the system has no file for it (console of Windows).
+
+    Args:
+        apart: by a descriptor of its own; the stream's leads to stderr from now on.
+    """
     buffer = getattr(stream, "buffer", None)
     raw = getattr(buffer, "raw", buffer)  # unbuffered (`python -u`) it is the same
     if not (isinstance(stream, io.TextIOWrapper) and type(raw) is io.FileIO):
         return stream
     stream.flush()
-    lasting: Any = _Lasting(stream.fileno(), "w", closefd=False)
+    number = stream.fileno()
+    if apart:
+        number = os.dup(number)
+        os.dup2(2, stream.fileno())
+    lasting: Any = _Lasting(number, "w", closefd=False)
     return io.TextIOWrapper(
         lasting if raw is buffer else io.BufferedWriter(lasting),
         stream.encoding,
@@ -175,7 +184,7 @@ def _load_early(modules: tuple[str, ...]) -> None:
     OpenBLAS waits for ever where it gets no memory while it is loaded, and LLVM ends the process.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # each thread takes 40 MB of addresses
-    for module in modules:
+    for module in ("recon", *modules):  # recon first: where numba is there already, it uses no compiled kernels
         import_module(module)
     numba: Any = import_module("numba")
     numba.njit(_nothing)()

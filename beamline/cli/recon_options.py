@@ -232,7 +232,7 @@ recon_options = together(
         of_one_call=True,
         repeated=False,
         is_flag=True,
-        help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
+        help="Print the memory, time and disk space that it will take, and end. Nothing is run.",
     ),
     option(
         "--beside-scan",

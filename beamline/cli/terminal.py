@@ -31,6 +31,7 @@ from beamline.core.events import (
     TrialReached,
     VolumeDone,
 )
+from beamline.core.machine_speed import seconds_left
 from beamline.core.narration import sentence
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.sinks import Warn, Warnings
@@ -192,11 +193,12 @@ def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
 
 def print_dry_run(plan: Callable[[Warn], tuple[Any, Any]], folder: Path, as_json: bool) -> None:
     """Print what a comparison will take; see `beamline.trials.dry_run`."""
+    from beamline.core.machine_speed import MachineSpeed
     from beamline.trials.dry_run import dry_run
 
     clock = SystemClock()
     with events_shown(as_json) as sink:
-        expected = dry_run(plan, folder, Warnings(sink, clock))
+        expected = dry_run(plan, folder, Warnings(sink, clock), MachineSpeed())
         sink(Done(expected, time=clock.now()))
     if not as_json:
         click.echo("\n".join(expected.lines()))
@@ -236,8 +238,8 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
         if now - last_line_at < SAY_EVERY and n < total:
             return
         last_line_at = now
-        rate = n / max(now - began, 1e-9)
-        sink(Counted(stage, n, total, rate, (total - n) / rate, time=now))
+        spent = max(now - began, 1e-9)
+        sink(Counted(stage, n, total, n / spent, seconds_left(n, total, spent) or 0.0, time=now))
 
     return progress
 

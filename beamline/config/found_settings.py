@@ -7,9 +7,7 @@ here what it must restore.
 from __future__ import annotations
 
 import json
-import os
 import re
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +15,7 @@ from zlib import crc32
 
 from beamline.core.errors import DataError
 from beamline.core.files import write_whole
+from beamline.core.machine import state_folder
 from drivers.base.protocols import RotationStage
 from drivers.stages.kept import RestoresSettings
 
@@ -26,16 +25,7 @@ _IDENTITY = ("model", "serial", "device", "axis", "channel")
 def keep_found_settings(stage: RotationStage, folder: Path | None = None) -> None:
     """Keep them on disk from now on; what an earlier program left there is restored in their place."""
     if isinstance(stage, RestoresSettings):
-        stage.keep_found_settings(FoundOnDisk(file_of(stage.describe(), folder or state_folder())))
-
-
-def state_folder() -> Path:
-    """Where this user's programs keep them."""
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    else:
-        base = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return base / "splatline" / "stages"
+        stage.keep_found_settings(FoundOnDisk(file_of(stage.describe(), folder or state_folder() / "stages")))
 
 
 def file_of(said: Mapping[str, object], folder: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import re
 import sys
@@ -30,7 +31,7 @@ def machine() -> dict[str, str | int]:
     import torch
 
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": usable_cores(),
         "threads": int(numba.get_num_threads()),
         "system": f"{platform.system()} {platform.machine()}",
@@ -86,7 +87,17 @@ def reset_peak_memory() -> None:
         _CLEAR.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): reset the peak resident set size
 
 
-def _processor() -> str:
+def state_folder() -> Path:
+    """Where this user's programs keep what outlives them."""
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    else:
+        base = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    return base / "splatline"
+
+
+def processor() -> str:
+    """The name of its processor."""
     if _CPUINFO.is_file():
         for line in _CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines():
             name, _, value = line.partition(":")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from beamline.core.events import PhaseReached, Sink
+from beamline.core.machine_speed import seconds_left
 from drivers.base.clock import Clock, SystemClock
 
 _SAY_EVERY = 0.2  # s between events on the progress of a phase
@@ -39,9 +40,8 @@ class Phases:
             return
         if now - self._said >= _SAY_EVERY or n == total:
             self._said = now
-            rate = n / max(now - self._begun, 1e-9)
-            left = (total - n) / rate if rate > 0 else None
-            self._say(n, total, rate, left)
+            spent = max(now - self._begun, 1e-9)
+            self._say(n, total, n / spent, seconds_left(n, total, spent))
 
     def end(self) -> None:
         """End the last phase now."""

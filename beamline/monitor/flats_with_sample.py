@@ -181,10 +181,13 @@ def with_sample(
     light = [[_cells(flat, base) for flat in group] for group in flats]
     means = [np.mean(group, axis=0) for group in light]
     bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
+    shining = None if single or len(flats) < 2 else _outshining(flats, darks, views)
     found = []
     for at, group in enumerate(flats):
         if not bright[at] > UNLIT * max(bright):
             continue  # without light, which is another fault
+        if shining is not None and np.delete(shining.tops, at).min() > shining.tops[at] + shining.limit:
+            continue  # the views outshine all others, which hold something
         if single:  # of two flats each is the other one's only witness
             own, n = light[at], len(group)
             rest = [own[:i] + own[i + 1 :] for i in range(n)]
@@ -213,6 +216,82 @@ def with_sample(
                     OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, sentence) for frame in frames
                 ]
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Outshining:
+    """How much brighter than each group of flats views are, where they are emptiest.
+
+    Attributes:
+        tops: of each group, line integral by which they are brighter in the brightest places; about 0 of an open beam.
+        edges: the same at the edge of the field where it is least.
+        unlike: line integrals by which each group differs in places from that with the least top, but for a factor.
+        noise: of a place, in the difference of two groups.
+    """
+
+    tops: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    unlike: NDArray[np.float64]
+    noise: float
+
+    @property
+    def limit(self) -> float:
+        return max(AIR, CHANGE_SIGMAS * self.noise)
+
+
+def _outshining(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> _Outshining | None:
+    views = lit_views(views, darks)
+    if len(views) < EMPTY or not flats:
+        return None
+    base = _base(darks)
+    light = [np.asarray(np.mean([_cells(flat, base) for flat in group], axis=0), np.float32) for group in flats]
+    lit = lit_places(np.maximum.reduce(light))
+    if not lit.any():
+        return None
+    seen = [_cells(view, base) for view in views]
+    emptiest = np.stack(
+        [np.percentile([_log(view, open_beam, lit) for view in seen], 100 - SHALLOW, axis=0) for open_beam in light]
+    )
+    tops = np.percentile(emptiest, WORST, axis=1)
+    columns = np.nonzero(lit)[1]
+    n = max(1, lit.shape[1] // EDGE)
+    sides = [columns < columns.min() + n, columns > columns.max() - n]
+    edges = np.min([np.median(emptiest[:, side], axis=1) for side in sides], axis=0)
+    best = light[int(np.argmin(tops))]
+    changes = [_log(each, best, lit) for each in light]
+    unlike = np.array([np.percentile(np.abs(change - np.median(change)), WORST) for change in changes])
+    return _Outshining(tops, edges, unlike, max(noise_of(change) for change in changes))
+
+
+def outshone(flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], views: Group) -> list[OddFrame]:
+    """Groups of flats that views outshine in places, and no other flats there: something was in the beam.
+
+    Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
+    """
+    seen = _outshining(flats, darks, views) if len(flats) > 1 else None
+    if seen is None:
+        return []
+    limit, least = seen.limit, float(seen.tops.min())
+    odd = []
+    for group, top, unlike in zip(flats, seen.tops.tolist(), seen.unlike.tolist(), strict=True):
+        if min(top, top - least, unlike) > limit:
+            sentence = (
+                f"in places the views are brighter than they by {{figures}} of line integral (limit {limit:.2g}), and "
+                f"than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
+                "something else, was in the beam."
+            )
+            odd += [OddFrame(frame, FaultKind.SAMPLE_IN, top, limit, sentence) for frame in group]
+    return odd
+
+
+def brighter_in_places(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
+    """Line integral by which views outshine the flats in places, but not at an edge of the field; None: nowhere."""
+    seen = _outshining(flats, darks, views)
+    if seen is None:
+        return None
+    most = max(range(len(flats)), key=lambda at: seen.tops[at])
+    top = float(seen.tops[most])
+    return top if min(top, top - float(seen.edges[most])) > seen.limit else None
 
 
 def _base(darks: list[list[ReferenceFrame]] | Sequence[Group]) -> Places | float:

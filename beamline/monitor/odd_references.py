@@ -10,7 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, OddFrame, Places, lit_views, noise_of, varies, with_sample
+from beamline.monitor.flats_with_sample import (
+    BLOCK_SIGMAS,
+    OddFrame,
+    Places,
+    lit_views,
+    noise_of,
+    outshone,
+    varies,
+    with_sample,
+)
 from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
@@ -54,6 +63,7 @@ def without_odd(
     if views:
         flats = _split(flats, with_sample(flats, darks, views, single=True), judged)
         flats = _split(flats, with_sample(flats, darks, views, single=False), judged)
+        flats = _split(flats, outshone(flats, darks, views), judged)
     return [*darks, *flats, *blank], judged
 
 

@@ -16,8 +16,9 @@ from typing import Any, Literal, Self, get_args
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
 from beamline.core.files import RECON, named_on_failure, remove, whole_file
+from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
-from beamline.core.text import size
+from beamline.core.text import count, size
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
@@ -98,38 +99,70 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
 
 
 @dataclass(frozen=True)
+class Need:
+    """What the reconstruction of a scan takes.
+
+    Attributes:
+        seconds: at most; None: not known.
+        memory, disk: bytes, for the result and meanwhile.
+        refusal: why it would fail; empty: it would not.
+    """
+
+    seconds: float | None = None
+    memory: int = 0
+    disk: int = 0
+    refusal: str = ""
+
+
+@dataclass(frozen=True)
 class BatchPlan:
     """What a call would do.
 
     Attributes:
         rows: all rows of the table, with those of this call.
-        sizes: bytes of the file of each scan that waits, by its row's name; where the file is there.
-        seconds: of all scans that wait, from those that are done and the sizes of the files; None: none is done.
+        needs: of each scan that waits, by its row's name.
+        seconds: of all scans that wait and whose time is known, at most.
+        memory: bytes, of the largest.
+        disk: bytes, of all.
     """
 
     folder: Path
     rows: Sequence[BatchRow]
-    sizes: Mapping[str, int]
-    seconds: float | None
+    needs: Mapping[str, Need]
+    seconds: float
+    memory: int
+    disk: int
 
     def lines(self) -> list[str]:
         """For people."""
         width = max((len(row.name) for row in self.rows), default=4)
-        rows = [f"{row.name:<{width}}  {row.state:<8}{row.scan}" for row in self.rows]
-        waiting = sum(not row.has_volume for row in self.rows)
-        hint = "not known before a scan is done; `beamline recon SCAN --dry-run` measures it, and the memory, for one"
-        time = hint if self.seconds is None else f"about {duration_text(self.seconds)}, from the scans that are done"
+        rows = [f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{row.scan}" for row in self.rows]
+        refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]
+        unknown = sum(needs.seconds is None and not needs.refusal for needs in self.needs.values())
+        time = f"about {duration_text(self.seconds)} at most, reading and correction not counted"
+        time += f", beside {count(unknown, 'scan')} whose time is not known" if unknown else ""
+        fails = f"; {len(refused)} of them would fail" if refused else ""
         return [
             *rows,
             "",
-            f"{'scans':<10}{len(self.rows)}; {waiting} to be reconstructed, {size(sum(self.sizes.values()))} of files",
-            f"{'time':<10}{time if waiting else 'none: every scan has a volume'}",
+            *([*refused, ""] if refused else []),
+            f"{'scans':<10}{len(self.rows)}; {len(self.needs)} to be reconstructed{fails}",
+            f"{'time':<10}{time if self.needs else 'none: every scan has a volume'}",
+            f"{'memory':<10}{size(self.memory)} for the largest",
+            f"{'disk':<10}{size(self.disk)}",
             f"{'output':<10}{self.folder}: {TABLE}, and a folder a scan (not written now)",
         ]
 
+    def _time_of(self, row: BatchRow) -> str:
+        needs = self.needs.get(row.name)
+        return "" if needs is None or needs.seconds is None else duration_text(needs.seconds)
 
-def planned_batch(options: BatchOptions) -> BatchPlan:
-    """What `run_batch` would do. Nothing is written, and no scan is opened.
+
+def planned_batch(options: BatchOptions, needs_of: Callable[[str], Need]) -> BatchPlan:
+    """What `run_batch` would do. Nothing is written, and no frame is read.
+
+    Args:
+        needs_of: what the reconstruction of a scan file by the recipe takes.
 
     Raises:
         DataError: as `run_batch`, which would refuse the folder.
@@ -139,11 +172,10 @@ def planned_batch(options: BatchOptions) -> BatchPlan:
         _refuse_other(folder, b"" if options.recipe is None else options.recipe.read_bytes())
         earlier = _read(folder)
     rows = _rows(options.scans, earlier)
-    bytes_of = {row.name: path.stat().st_size for row in rows if (path := Path(row.scan)).is_file()}
-    waiting = {row.name: bytes_of[row.name] for row in rows if not row.has_volume and row.name in bytes_of}
-    done = [row for row in rows if row.has_volume and row.seconds and bytes_of.get(row.name)]
-    rate = sum(row.seconds or 0 for row in done) / sum(bytes_of[row.name] for row in done) if done else None
-    return BatchPlan(folder, rows, waiting, None if rate is None else rate * sum(waiting.values()))
+    needs = {row.name: needs_of(row.scan) for row in rows if not row.has_volume}
+    each = needs.values()
+    seconds, disk = sum(scan.seconds or 0.0 for scan in each), sum(scan.disk for scan in each)
+    return BatchPlan(folder, rows, needs, seconds, max((scan.memory for scan in each), default=0), disk)
 
 
 class Worker:
@@ -223,9 +255,9 @@ def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) ->
     start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
     for tried, n in enumerate(waiting):
         spent = clock.now() - start
-        seconds_left = spent / tried * (len(waiting) - tried) if tried else None
+        eta = seconds_left(tried, len(waiting), spent)
         rate = 60 * tried / max(spent, 1e-9)
-        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, seconds_left, rate, time=clock.now()))
+        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
         rows[n] = _one(rows[n], options, worker, sink, clock)
         _write(folder, rows)
         row = rows[n]

@@ -1,4 +1,4 @@
-"""Reconstruction within a time: measure this machine on this scan, choose method and settings, and end in time."""
+"""Reconstruction within a time: choose method and settings by what they take on this machine, and end in time."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import recon
+from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
@@ -20,9 +21,10 @@ from recon.auto import is_wider
 from recon.base.binning import bin_views
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
-from recon.machine_speed import measured_speeds
+from recon.base.work import Rates
 from recon.methods import with_settings
 from recon.splatting.initialise import default_count
+from recon.splatting.work import speeds_of
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
@@ -41,7 +43,7 @@ class Budgeted:
 
     Attributes:
         prepared: the reconstructed views, with binned pixels if the choice bins them.
-        choice, speeds: what was chosen, and the measurements behind it.
+        choice, speeds: what was chosen, and what its parts were expected to take.
         because: why this method, in words; empty if there was no other.
         seconds: of everything, small runs that measure the speed included.
     """
@@ -125,6 +127,7 @@ def within(
     control: RunControl,
     warn: Warn,
     largest: int | None = None,
+    rates: Rates | None = None,
 ) -> Budgeted:
     """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
 
@@ -138,13 +141,14 @@ def within(
         methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.
             Iterations on voxels are none where the sample is wider than the field.
         largest: binning; None: any.
+        rates: of this machine; None: measured, or those kept.
 
     Raises:
         ValueError: the views cannot be reconstructed.
     """
     now, begin = control.now, control.now()
-    data, geometry = prepared.projections.data, prepared.geometry
-    speeds = measured_speeds(data, geometry, Grid.matching(geometry), now)
+    geometry = prepared.geometry
+    speeds = speeds_of(geometry, Grid.matching(geometry), rates or MachineSpeed())
     unbinned = default_count(geometry, geometry.sample_pitch)  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}

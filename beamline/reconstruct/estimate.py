@@ -12,14 +12,11 @@ from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
-from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
-from recon.base.method import Method, volumes_of
+from recon.base.method import volumes_of
 from recon.base.slabs import slabs_of
 from recon.base.volume import Grid
-from recon.run_time import Extent, RunTime, run_seconds
-from recon.series import Series
-from recon.series_time import series_seconds
+from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,8 @@ class Estimate:
         done: slices that a partial volume has.
         scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
         output, free: bytes of the result, and bytes on its disk.
-        seconds: at most, without reading and correction.
-        least_seconds: where the data shorten the work as much as they may; otherwise `seconds`.
+        seconds: at most, without reading and correction; None: the method does not say what it computes.
+        least_seconds: where the data choose what takes least; otherwise `seconds`.
     """
 
     method: str
@@ -50,16 +47,13 @@ class Estimate:
     scratch: int
     output: int
     free: int
-    seconds: float
-    least_seconds: float
+    seconds: float | None
+    least_seconds: float | None
 
     def lines(self) -> list[str]:
         in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
         if self.done:
             in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
-        time = f"about {duration_text(self.seconds)}"
-        if self.least_seconds < self.seconds:
-            time = f"at most {time}; about {duration_text(self.least_seconds)} where the data shorten it"
         how = in_slabs if self.scratch else "all at once"
         *several, z, y, x = self.shape
         what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
@@ -67,12 +61,22 @@ class Estimate:
             f"{what}{z} x {y} x {x} voxels by {self.method}, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
-            f"{'time':<10}{time}, reading and correction not counted",
+            f"{'time':<10}{self._time()}",
         ]
 
+    def _time(self) -> str:
+        if self.seconds is None or self.least_seconds is None:
+            return f"not known: {self.method} does not say what it computes"
+        most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
+        span = f"{most}; {least} where the data end it early" if self.least_seconds < self.seconds else most
+        return f"{span}, reading and correction not counted"
 
-def estimate(options: ReconOptions, clock: Clock) -> Estimate:
-    """Estimate for a finished scan; for a partial volume, of the missing slabs.
+
+def estimate(options: ReconOptions, rates: Rates) -> Estimate:
+    """Estimate for a finished scan; for a partial volume, of the missing slabs. No frame is read, and nothing is run.
+
+    Args:
+        rates: of this machine.
 
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
@@ -113,23 +117,19 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             f"with -o to another disk, or give --bin {2 * options.selection.binning}."
         )
     heights = [slab.slices.stop - slab.slices.start for slab in missing]
-    extent = Extent(geometry, heights, decided=options.partial is not None)
     try:
-        seconds = _seconds(needs.method, extent, clock) if missing else RunTime(0.0, 0.0)
+        costs = costs_of(needs.method, parts_of(geometry, heights), decided=options.partial is not None)
     except ValueError as error:  # as the method itself refuses the views
         raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
-    most, least = (each * (1 + options.uncertainty) for each in seconds)  # error bars take at most as long
+    span = None if costs is None else seconds_of(costs, rates)
+    if not missing:
+        span = Span(0.0, 0.0)
+    times = 1 + options.uncertainty  # error bars take at most as long
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
     height = slabs[0].own.stop
     of_all = shape if (several := volumes_of(needs.method)) == 1 else (several, *shape)
     return Estimate(
         options.method.name, geometry.n_views, of_all, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
-        most, least,
+        None if span is None else times * span.most, None if span is None else times * span.least,
     )  # fmt: skip
-
-
-def _seconds(method: Method, extent: Extent, clock: Clock) -> RunTime:
-    if isinstance(method, Series):
-        return series_seconds(extent.geometry, method.volumes, method.moves, method.sweeps, clock.now)
-    return run_seconds(method, extent, clock.now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
+from beamline.core.machine_speed import seconds_left
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 
@@ -23,12 +24,12 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
         step = progress.step
         made, spent = progress.step - first.step, progress.seconds - first.seconds
         rate = made / spent if made > 0 and spent > 0 else None
-        seconds_left = None
-        if progress.steps and rate:
-            seconds_left = (progress.steps - progress.step) / rate
-        elif seconds is not None and not progress.steps and not progress.unit:
-            seconds_left = max(0.0, seconds - spent)
-        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=seconds_left, time=clock.now()))
+        eta = None
+        if progress.steps:
+            eta = seconds_left(made, progress.steps - first.step, spent)
+        elif seconds is not None and not progress.unit:
+            eta = max(0.0, seconds - spent)
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=eta, time=clock.now()))
 
     return on_progress
 

@@ -12,6 +12,7 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Counted, Sink, StateEntered
 from beamline.core.machine import free_memory
+from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import count, size
@@ -299,8 +300,8 @@ def prepare_within(
 
     def progress(n: int, total: int) -> None:
         now = clock.now()
-        rate = n / max(now - began, 1e-9)
-        sink(Counted("correction", n, total, rate, (total - n) / rate, time=now))
+        spent = max(now - began, 1e-9)
+        sink(Counted("correction", n, total, n / spent, seconds_left(n, total, spent) or 0.0, time=now))
 
     def say(text: str) -> None:
         sink(StateEntered("memory", text, time=clock.now()))

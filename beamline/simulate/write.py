@@ -14,6 +14,7 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.core.events import FrameStored, Sink
 from beamline.core.files import refuse_existing
+from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM
@@ -112,8 +113,8 @@ def _preview_bin(shape: tuple[int, int]) -> int:
 
 def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: FrameKind) -> FrameStored:
     rate = n / seconds if seconds > 0 else 0.0
-    left = (total - n) / rate if rate > 0 else 0.0
-    return FrameStored(n, total, kind.name.lower(), rate, rate * 2e-6 * math.prod(shape), left)
+    eta = seconds_left(n, total, seconds) or 0.0
+    return FrameStored(n, total, kind.name.lower(), rate, rate * 2e-6 * math.prod(shape), eta)
 
 
 def _info(scene: SceneFile, scan: Scan) -> ScanInfo:

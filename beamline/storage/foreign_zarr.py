@@ -5,6 +5,7 @@ Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; transl
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import TEXT, require_below
+from beamline.core.files import TEXT, bytes_below, require_below
 from beamline.core.machine import free_memory
-from beamline.storage.header import shape_of
+from beamline.storage.header import numbers_of, shape_of
 
 _METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _FACTS = (*_METADATA, ".zattrs", ".zmetadata")
+_SHAPES = "shape", "chunks", "chunk_shape"
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -114,7 +116,10 @@ def _regular_files(path: Path) -> Any:
 
     def look_at(key: str) -> None:
         with suppress(FileNotFoundError, NotADirectoryError):  # a chunk of the fill value
-            require_below(path, key, TEXT if key.rpartition("/")[2] in _FACTS else math.inf)
+            if key.rpartition("/")[2] in _FACTS:
+                _refuse_truths(json.loads(bytes_below(path, key, TEXT)))
+            else:
+                require_below(path, key, math.inf)
 
     class RegularFiles(LocalStore):
         async def get(self, key: str, *args: Any, **options: Any) -> Any:
@@ -134,6 +139,14 @@ def _regular_files(path: Path) -> Any:
     return RegularFiles(path, read_only=True)
 
 
+def _refuse_truths(said: Any, key: str = "") -> None:
+    """ValueError where a shape or a chunk has true or false for a number, which the library takes for 1 or 0."""
+    if isinstance(said, list) and key in _SHAPES and any(isinstance(n, bool) for n in said):
+        raise ValueError(f"its {key} is {said}; expected whole numbers")
+    for name, each in said.items() if isinstance(said, dict) else ():
+        _refuse_truths(each, name)
+
+
 def _image(root: Any) -> Mapping[str, Any]:
     """The first image of an OME-Zarr; {} without."""
     said = root.attrs.get("ome", root.attrs)
@@ -145,7 +158,7 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
     """None where a unit or the size is not stated."""
     (mine,) = [each for each in image.get("datasets", []) if each["path"] == name] or [{}]
     steps = [*mine.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
-    scales = [np.asarray(step["scale"][axes - 3 :], float) for step in steps if step["type"] == "scale"]
+    scales = [numbers_of(step["scale"], axes, "scale")[-3:] for step in steps if step["type"] == "scale"]
     units = [_MM.get(axis.get("unit", "")) for axis in image.get("axes", [])[axes - 3 :] if isinstance(axis, Mapping)]
     if not scales or len(units) != 3 or None in units:
         return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,6 +28,17 @@ def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
         raise ValueError(f"its {what} is {_brief(said)}; expected numbers from 1 on, of a volume that can be")
     z, y, x = map(int, sides)
     return z, y, x
+
+
+def numbers_of(said: Any, n: int, what: str) -> tuple[float, ...]:
+    """So many finite numbers."""
+    if not isinstance(said, list) or len(said) != n or not all(_is_number(each) for each in said):
+        raise ValueError(f"its {what} is {_brief(said)}; expected {n} numbers")
+    return tuple(map(float, said))
+
+
+def _is_number(said: Any) -> bool:
+    return isinstance(said, int | float) and not isinstance(said, bool) and abs(said) <= sys.float_info.max
 
 
 def dtype_of(said: Any) -> np.dtype[Any]:

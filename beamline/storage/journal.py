@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import DataError
-from beamline.core.files import folder_to_disk, to_disk, whole_file
+from beamline.core.files import bytes_below, folder_to_disk, to_disk, whole_file
 from beamline.core.text import size
 
 _FORMAT = "splatline journal 1"
+_LARGEST = 2**31  # bytes of a journal: it has the few that differ
 _BLOCK = 4096  # bytes, in which disks give room
 
 
@@ -92,7 +93,7 @@ def pending(path: Path) -> FileChanges | None:
     """
     journal = journal_of(path)
     try:
-        changes = _changes(path, journal.read_bytes())
+        changes = _changes(path, bytes_below(journal.parent, journal.name, _LARGEST))
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -168,11 +169,17 @@ def _changes(path: Path, journal: bytes) -> FileChanges | None:
     if first != f"{_FORMAT} {hashlib.sha256(content).hexdigest()}".encode():
         return None
     head, _, data = content.partition(b"\n")
-    said, ranges = json.loads(head), []
-    for at, n_old, n_new in said["ranges"]:
-        ranges.append(FileChange(at, data[:n_old], data[n_old : n_old + n_new]))
-        data = data[n_old + n_new :]
-    return FileChanges(path, said["length"], tuple(ranges))
+    try:
+        said, ranges = json.loads(head), list[FileChange]()
+        length, numbers = said["length"], [tuple(each) for each in said["ranges"]]
+        if not all(type(n) is int and 0 <= n < 2**63 for each in (*numbers, (length,)) for n in each):
+            return None
+        for at, n_old, n_new in numbers:
+            ranges.append(FileChange(at, data[:n_old], data[n_old : n_old + n_new]))
+            data = data[n_old + n_new :]
+    except (ValueError, TypeError, LookupError, RecursionError):
+        return None
+    return FileChanges(path, length, tuple(ranges))
 
 
 def _get(file: Any, at: int, n: int) -> bytes:

@@ -13,12 +13,13 @@ import psutil
 from beamline.core.machine import free_memory
 from beamline.core.sinks import Warn
 from beamline.core.text import count, size
-from beamline.trials.cost import expected_seconds, sweep_seconds
 from beamline.trials.data import TrialData
+from beamline.trials.plans import expected_span
 from beamline.trials.runner import Planned
 from beamline.trials.trial import Trial
 from recon.assess.time_model import duration_text
 from recon.base.volume import Grid
+from recon.base.work import Rates
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class ExpectedTrial:
     """What a trial will take.
 
     Attributes:
-        seconds: of processor time, with the start of its process; None: not known before it is tried.
+        seconds: with the start of its process, at most; None: not known before it is tried.
         memory: bytes of its process; None: not known.
     """
 
@@ -74,11 +75,11 @@ class ExpectedRun:
         unknown = sum(trial.seconds is None for trial in self.trials)
         beside = f", beside {count(unknown, 'trial')} whose time is not known" if unknown else ""
         return [
-            f"{'trial':<{width}}{'CPU s':>8}{'MB':>8}",
+            f"{'trial':<{width}}{'s':>8}{'MB':>8}",
             *rows,
             "",
             f"{'trials':<10}{len(self.trials)}",
-            f"{'time':<10}about {duration_text(self.seconds)} of processor time, with starts of processes{beside}",
+            f"{'time':<10}about {duration_text(self.seconds)}, with starts of processes{beside}",
             f"{'memory':<10}{size(self.memory)} in the largest process; {size(self.allowed)} are free",
             f"{'disk':<10}{size(self.disk)} for the views meanwhile; {size(self.free)} free",
             f"{'output':<10}{self.folder}: {self.stage}.csv, {self.stage}.json, page and pictures (not written now)",
@@ -89,11 +90,13 @@ def dry_run(
     plan: Callable[[Warn], tuple[TrialData, Planned]],
     folder: Path,
     warn: Warn,
+    rates: Rates,
     now: Callable[[], float] = time.process_time,
 ) -> ExpectedRun:
-    """Plan a comparison and measure a sweep; nothing is written. Times are rough: within a factor of two.
+    """Plan a comparison; nothing is written, and nothing is run.
 
     Args:
+        rates: of this machine.
         now: processor time of this process. What it has taken by now is the start of a process.
 
     Raises:
@@ -101,15 +104,15 @@ def dry_run(
     """
     start, own_bytes = now(), int(psutil.Process().memory_info().rss)
     data, planned = plan(warn)
-    sweep = sweep_seconds(data.geometry, now)
     table = planned.table
     trials = [table.outcomes[n].trial for n in table.todo]
     if planned.reference is not None:
         trials = [planned.reference, *trials]
 
     def expected(trial: Trial) -> ExpectedTrial:
-        seconds = expected_seconds(trial, data.geometry, sweep)
-        return ExpectedTrial(trial.label, None if seconds is None else start + seconds, _memory(trial, data, own_bytes))
+        span = expected_span(trial, data.geometry, rates)
+        seconds = None if span is None else start + span.most
+        return ExpectedTrial(trial.label, seconds, _memory(trial, data, own_bytes))
 
     free = shutil.disk_usage(folder.absolute().parent).free
     return ExpectedRun(planned.layout.name, folder, tuple(map(expected, trials)), _bytes(data), free, free_memory())

@@ -13,8 +13,9 @@ from beamline.trials.data import TrialData
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.energy_fit import EnergyViews
-from recon.series import TimedViews, fit_series
+from recon.series import TimedViews, fit_series, series_costs
 from recon.share_fit import fit_share
 from recon.spectral import fit_materials
 from recon.warm_up import toy_of
@@ -42,6 +43,9 @@ class SharedFit(Protocol):
             ValueError: too few views, or settings that there are not.
         """
 
+    def costs(self, geometry: Geometry) -> Costs | None:
+        """Its work on all views; None: not known before it is tried."""
+
     def toy(self) -> Self:
         """The same fit with as little work as still runs its kernels."""
 
@@ -64,6 +68,9 @@ class SeriesFit:
         lines, weights = _measured_lines(data)
         timed = TimedViews(lines, data.geometry, data.shown[: data.geometry.n_views], weights)
         return fit_series(timed, self.volumes, motion=MOTION[self.motion][0], seed=seed, **given).at
+
+    def costs(self, geometry: Geometry) -> Costs | None:
+        return series_costs(geometry, self.volumes, MOTION[self.motion][0])
 
     def toy(self) -> Self:
         return replace(self, volumes=2, motion="learnt" if MOTION[self.motion][0] is None else self.motion)
@@ -94,6 +101,9 @@ class MaterialsFit:
         if self.share:
             made = fit_share(views, made, (data.states[0], data.states[1]))
         return lambda energy: np.tensordot(sections[int(energy)].astype(np.float32), made.densities, 1)
+
+    def costs(self, geometry: Geometry) -> Costs | None:
+        return None
 
     def toy(self) -> Self:
         return self

@@ -7,14 +7,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
 
+import numpy as np
+
+from beamline.core.machine_speed import seconds_left
 from beamline.trials.joint import MOTION
 from beamline.trials.trial import Outcome, Trial
+from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
+from recon.base.volume import Grid
+from recon.base.work import Rates, Span, costs_of, seconds_of
 from recon.methods import by_name
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
@@ -227,41 +234,73 @@ class Timed:
         return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
-def seconds_left(
-    done: Sequence[Timed], trials: Sequence[Trial], cost: Callable[[Trial], float | None] = lambda trial: None
-) -> float | None:
-    """How long the trials that are left will take, from those done; None before the first.
+def expected_span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
+    """s that a trial on some of these views reconstructs.
 
-    Each takes the same time to start and measure, and more in proportion to its work. Work is compared within a method;
-    a method not yet seen takes its time in proportion to its cost, or what the others did on average, and one with a
-    time takes it.
+    None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
+    """
+    with suppress(ValueError):
+        return _span(trial, geometry, rates)
+    return None
+
+
+def _span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
+    some = geometry.select(np.arange(trial.views) * geometry.n_views // trial.views)
+    if (fit := trial.joint) is not None:
+        costs = fit.costs(some)
+        return None if costs is None else seconds_of(costs, rates)
+    method = trial.build()
+    if trial.seconds_asked is not None and not method.traits.own_length:
+        return Span(trial.seconds_asked, trial.seconds_asked)
+    coarse = some.binned(trial.binning)
+    parts = [coarse.select(views) for views in np.array_split(np.arange(trial.views), trial.parts)]
+    if trial.halves:
+        parts += [coarse.select(slice(first, None, 2)) for first in (0, 1)]
+    each = [costs_of(method, [(part, Grid.matching(part))]) for part in parts]
+    spans = [seconds_of(costs, rates) for costs in each if costs is not None]
+    if not spans:
+        return None
+    limit = math.inf if trial.seconds_asked is None else trial.seconds_asked
+    return Span(*(min(limit, sum(ends)) for ends in zip(*spans, strict=True)))
+
+
+def trials_left(
+    done: Sequence[Timed], trials: Sequence[Trial], expected: Callable[[Trial], float | None] = lambda trial: None
+) -> float | None:
+    """s that the trials to come will take, from those done; None before the first.
+
+    Each takes the same time to start and measure, and what is expected of it, at the pace of the trials that are done.
+    Where nothing is expected of a trial, it takes what those of its method did by their work, or what all did.
 
     Args:
-        cost: of a trial, to be compared among methods, too; None: not known.
+        expected: s of a trial; None: not known.
     """
     if not done:
         return None
     fixed = sum(each.wall - each.working for each in done) / len(done)
-    typical = sum(each.working for each in done) / len(done)
-    costs = [
-        (each.working, amount_expected)
+    told = [
+        (seconds, each.working)
         for each in done
-        if each.working > 0
-        and (amount_expected := cost(each.trial)) is not None
-        and not each.trial.build().traits.direct
+        if each.working > 0 and not each.trial.direct and (seconds := expected(each.trial))
     ]  # a direct method is over too soon to tell how fast this machine is
-    whole, total = sum(amount_expected for _, amount_expected in costs), 0.0
+    amount, spent = (sum(values) for values in zip(*told, strict=True)) if told else (1.0, 1.0)
+    total = 0.0
     for trial in trials:
-        if trial.seconds_asked is not None:
-            total += fixed + trial.seconds_asked
-            continue
+        total += fixed
         same = [each for each in done if each.trial.method == trial.method and each.working > 0]
-        amount = sum(work(each.trial) for each in same)
-        if amount > 0:
-            seconds = work(trial) * sum(each.working for each in same) / amount
-        elif whole > 0 and (unseen := cost(trial)) is not None:
-            seconds = unseen * sum(working for working, _ in costs) / whole
+        if trial.seconds_asked is not None:
+            total += trial.seconds_asked
+        elif same:
+            shares = [_share(each.trial, trial, expected) for each in same]
+            total += seconds_left(sum(shares), sum(shares) + 1, sum(each.working for each in same)) or 0.0
+        elif (seconds := expected(trial)) is not None:
+            total += seconds * spent / amount
         else:
-            seconds = typical
-        total += fixed + seconds
+            total += sum(each.working for each in done) / len(done)
     return total
+
+
+def _share(done: Trial, trial: Trial, expected: Callable[[Trial], float | None]) -> float:
+    """What a trial took of the time of another one of the same method: as expected, else by their work."""
+    of_done, of_trial = expected(done), expected(trial)
+    return of_done / of_trial if of_done and of_trial else work(done) / work(trial)

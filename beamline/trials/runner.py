@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
 from beamline.core.files import refuse_existing, result_folder
+from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
@@ -23,17 +24,18 @@ from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.outcome import facts_of
 from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.readers.open import SourceOptions
-from beamline.trials.cost import expected_seconds
 from beamline.trials.data import TrialData, write_array
 from beamline.trials.launch import DATA, compile_kernels, run_trial
 from beamline.trials.layout import TableLayout, event_of, write_page, write_table
-from beamline.trials.plans import Timed, seconds_left
+from beamline.trials.plans import Timed, expected_span, trials_left
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.base.work import Rates
 
 _PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 _COMPILING = 0.5  # of the time left, at most: what is missing then is compiled by the trials, cheap ones first
@@ -132,7 +134,7 @@ class _Rig:
     Attributes:
         work: folder with the data.
         end: by `now`, when the last trial must be done; inf: no limit.
-        cost: of a trial, to be compared with others.
+        expected: s of a trial; None: not known.
     """
 
     work: Path
@@ -140,7 +142,7 @@ class _Rig:
     end: float
     now: Callable[[], float]
     emit: Callable[[Event], None]
-    cost: Callable[[Trial], float | None]
+    expected: Callable[[Trial], float | None]
 
     @property
     def seconds(self) -> float | None:
@@ -165,6 +167,7 @@ def run_comparison(
     clock: Clock,
     now: Callable[[], float] = time.monotonic,
     begun: float | None = None,
+    rates: Rates | None = None,
 ) -> TrialTable:
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
@@ -175,6 +178,7 @@ def run_comparison(
     Args:
         plan: reads the scan and says which trials to run.
         begun: by `now`, when the time of the run began; None: it begins here.
+        rates: of this machine; None: measured, or those kept.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
@@ -189,11 +193,11 @@ def run_comparison(
     data, planned = plan(Warnings(sink, clock))
     emit(planned.started)
     table, layout, slices, truth = planned.table, planned.layout, SliceSheet(), data.truth
-    cost = partial(expected_seconds, geometry=data.geometry)
+    expected = _expected(data.geometry, rates or MachineSpeed())
     with result_folder(folder) as work:
         data.save(work / DATA)
         del data
-        rig = _Rig(work, limits.seed, end, now, emit, cost)
+        rig = _Rig(work, limits.seed, end, now, emit, expected)
         if planned.reference is not None:
             _add_reference(rig, planned.reference, truth, slices)
         if truth is not None:
@@ -209,6 +213,17 @@ def run_comparison(
     summary = {"output": folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
+
+
+def _expected(geometry: Geometry, rates: Rates) -> Callable[[Trial], float | None]:
+    """s of a trial, on this machine; None: not known."""
+
+    @cache
+    def of_trial(trial: Trial) -> float | None:
+        span = expected_span(trial, geometry, rates)
+        return None if span is None else span.most
+
+    return of_trial
 
 
 def _usable(max_seconds: float) -> float:
@@ -258,11 +273,11 @@ def _each(table: TrialTable, layout: TableLayout, rig: _Rig, slices: SliceSheet)
     begin, timed, todo = rig.now(), list[Timed](), table.todo
     for n, index in enumerate(todo):
         trial, seconds = table.outcomes[index].trial, rig.seconds
-        if seconds is not None and (refusal := _no_time(seconds_left(timed, [trial], rig.cost) or 0.0, seconds)):
+        if seconds is not None and (refusal := _no_time(trials_left(timed, [trial], rig.expected) or 0.0, seconds)):
             table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
             yield table
             continue
-        eta = seconds_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.cost)
+        eta = trials_left(timed, [table.outcomes[other].trial for other in todo[n:]], rig.expected)
         eta = eta if eta is None or seconds is None else min(eta, seconds)
         rate = 60 * n / max(rig.now() - begin, 1e-9)
         rig.emit(TrialReached(layout.name, n, len(todo), trial.label, eta, rate))

@@ -55,6 +55,11 @@ class Trial:
         return JOINT[self.method](**self.settings) if self.method in JOINT else None
 
     @property
+    def direct(self) -> bool:
+        """Its method makes one pass without iterations."""
+        return self.method not in JOINT and by_name(self.method).traits.direct
+
+    @property
     def left_out(self) -> bool:
         """The scan has not the views that it asks for."""
         return self.choice is not None and self.choice.groups is None

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.events import Counted, Sink
+from beamline.core.machine_speed import seconds_left
 from beamline.xafs.contrast import ContrastRegions, XafsCurve, contrast_of, curve_of
 from drivers.base.clock import Clock
 
@@ -65,8 +66,9 @@ def run_series(series: Series, sink: Sink, clock: Clock, should_stop: Callable[[
         points.append(contrast_of(frame, series.regions))
         now, done = time.monotonic(), len(points)
         if now - reported >= REPORT_EVERY or done == series.n:
-            reported, rate = now, done / max(now - start, 1e-9)
-            sink(Counted("xafs", done, series.n, rate, (series.n - done) / rate, time=clock.now()))
+            reported, spent = now, max(now - start, 1e-9)
+            eta = seconds_left(done, series.n, spent) or 0.0
+            sink(Counted("xafs", done, series.n, done / spent, eta, time=clock.now()))
         if done < series.n and should_stop():
             stopped = True
             break

@@ -94,7 +94,7 @@ PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Prese
 
 @dataclass(frozen=True)
 class Speeds:
-    """Times measured on this machine for this scan, in s, without binning and with the default number of Gaussians.
+    """Times on this machine for this scan, in s, without binning and with the default number of Gaussians.
 
     Attributes:
         fbp: FBP of the whole volume.

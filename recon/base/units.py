@@ -75,10 +75,7 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     """
     if projections.ndim != 3 or projections.shape[0] < 2 or not projections.shape[1] or projections.shape[2] < 16:
         return False
-    views, rows, cols = projections.shape
-    looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
-    some = projections[np.unique(np.linspace(0, views - 1, looked_at).astype(int))]
-    some = some[:, np.unique(np.linspace(0, rows - 1, _ROWS).astype(int))].astype(np.float32)
+    some, cols = _some(projections), projections.shape[2]
     some[~np.isfinite(some)] = np.nan
     width, middle = cols // _EDGE or 1, some[..., cols // 3 : cols - cols // 3]
     edges = np.concatenate([some[..., :width], some[..., -width:]])
@@ -104,6 +101,33 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     return bool(step < flat and flat > max(_SIGMAS * uncertain, 1e-4 * beam))
 
 
+def _some(projections: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Views and rows of [view, row, col], evenly spread, as an array of its own."""
+    views, rows, cols = projections.shape
+    looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
+    some = projections[np.unique(np.linspace(0, views - 1, looked_at).astype(int))]
+    return some[:, np.unique(np.linspace(0, rows - 1, _ROWS).astype(int))].astype(np.float32)
+
+
+def look_like_light(projections: NDArray[np.floating]) -> bool:
+    """Whether values [view, row, col] given as line integrals look like transmission of a brighter beam, as counts and
+    percents do: far above 1 at the edges of the views, and less where the sample is."""
+    if projections.ndim != 3 or not projections.size:
+        return False
+    some, edge = _some(projections), projections.shape[2] // _EDGE or 1
+    sides = np.concatenate([some[..., :edge].ravel(), some[..., -edge:].ravel()])
+    level = float(np.median(sides[np.isfinite(sides)])) if np.isfinite(sides).any() else 0.0
+    return level > _OPAQUE and look_like_transmission(some / np.float32(level))
+
+
+def look_negative(projections: NDArray[np.floating]) -> bool:
+    """Whether values [view, row, col] given as line integrals look like those of the other sign: the logarithm of
+    transmission, which is 0 beside the sample and falls where it is."""
+    if projections.ndim != 3 or not projections.size:
+        return False
+    return look_like_transmission(np.exp(np.clip(_some(projections), -_OPAQUE, 1)))
+
+
 def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:
     """A UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
 
@@ -120,5 +144,11 @@ def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 
         warnings.warn(
             "projections are about 1 at the edges of the views and fall where the sample is: they look like "
             "transmission. Line integrals are its logarithm, -np.log(transmission), and rise there",
+            stacklevel=stacklevel,
+        )
+    elif look_negative(projections):
+        warnings.warn(
+            "projections are about 0 at the edges of the views and fall where the sample is: they look like the "
+            "logarithm of transmission. Line integrals are -np.log(transmission), and rise there",
             stacklevel=stacklevel,
         )

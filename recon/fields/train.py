@@ -20,10 +20,12 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
+from recon.base.work import CLOCK, Costs, Work
 from recon.fields.networks import Field
 from recon.fields.rays import Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume, leaves_the_field
 from recon.splatting.train import used_and_kept_back
+from recon.voxels.direct import direct_work
 from recon.voxels.voxel_problem import iterative_memory
 
 CHUNK = 2**15  # Samples that one pass through the network takes
@@ -104,6 +106,15 @@ class FieldMethod(ABC):
         """The method for a share of a volume: in its share of the seconds."""
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        """At most: `seconds` may end it."""
+        if self.seconds is not None:
+            return Costs({self.name: Work.of(CLOCK, self.seconds)})
+        samples = self.steps * self.rays * self.samples_of(max(grid.shape))
+        return Costs(
+            {self.name: direct_work(geometry, grid) + Work.of(f"field, {self.name}", samples, math.prod(grid.shape))}
+        )
+
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         across = max(grid.shape)
         with torch.device("meta"):
@@ -172,9 +183,9 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     if method.seconds is not None and fit.step < min(used.size, method.steps):
         pace = fit.seconds_of_steps / max(fit.step, 1)
         warnings.warn(
-            f"the {method.label} field ended after {fit.step} steps, before it saw each of its {used.size} views once: "
-            f"its volume shows little of the sample. A step takes about {pace:.2g} s here, so give about "
-            f"{pace * used.size:.2g} s more",
+            f"{method.label} ended after {fit.step} steps, before it saw each of its {used.size} views once: its "
+            f"volume shows little of the sample. A step takes about {pace:.2g} s here, so give about "
+            f"{pace * (used.size - fit.step):.0f} s more",
             stacklevel=2,
         )
     volume = Volume(fit.volume(problem.grid) * np.float32(unit), problem.grid)

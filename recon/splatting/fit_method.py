@@ -46,10 +46,10 @@ class FitMethod(Method, Protocol):
 
     @property
     def by_content(self) -> bool:
-        """Views held out tell whether the fit pays, see `finish.best_candidate`."""
+        """Views held out tell whether the fit pays, see `finish.judged`."""
 
-    def for_trial(self, share: float) -> Self:
-        """The fit alone, of this share of the rows."""
+    def for_trial(self, share: float, of_steps: float) -> Self:
+        """The fit alone, of this share of the rows, with this share of the steps."""
 
     @property
     def least_steps(self) -> int | None:

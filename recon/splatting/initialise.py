@@ -48,7 +48,7 @@ _WILD, _WILD_VIEWS = 10.0, 0.1
 # are empty: the air of a measured walnut has 0.07.
 _FARTHEST, _EMPTY = 0.95, 0.15
 
-_SCALED_BY = 12  # views
+SCALED_BY = 12  # views
 _COUNTS = 2000, 200_000  # Gaussians
 _LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
@@ -173,8 +173,7 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     ramp.
     """
     projections = without_wild_pixels(projections)
-    if _swept(geometry, start):
-        sweeps = OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True)
+    if (sweeps := start_method(geometry, start)) is not None:
         return solve(sweeps, Projector(geometry, grid), projections)
     ramp: Filter = "ram-lak" if start == "published" else "hann"
     if geometry.is_cone:
@@ -198,6 +197,11 @@ def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid
     lines, unit = volume_lines(np.maximum(volume.data, 0)), density_unit(volume)
     matter = np.count_nonzero(lines > MATTER * unit)
     return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
+
+
+def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
+    """The sweeps that make the first volume; None: FBP or FDK does."""
+    return OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True) if _swept(geometry, start) else None
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:
@@ -304,7 +308,7 @@ def scale_to_data(
     Projection is linear in density, so this is the exact least-squares factor. It replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
-    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(_SCALED_BY, geometry.n_views)).round().astype(int))
+    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(SCALED_BY, geometry.n_views)).round().astype(int))
     rendered = project(gaussians, geometry, chosen.tolist(), model=rays).numpy()
     measured = np.asarray(projections[chosen], np.float64)
     power = float((rendered.astype(np.float64) ** 2).sum())

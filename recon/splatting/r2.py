@@ -16,6 +16,7 @@ from recon.base.choices import DEFAULT_STEPS, MODEL_STEPS, Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
@@ -24,6 +25,7 @@ from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
+from recon.splatting.work import fit_costs
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 
@@ -36,7 +38,7 @@ class R2:
 
     Attributes:
         steps: of the fit. 0 gives the starting point. None takes 400, or 50 where views held out say that voxels alone
-            predict as well: then they make the volume, see `finish.best_candidate`. With `seconds` it takes as many as
+            predict as well: then they make the volume, see `finish.judged`. With `seconds` it takes as many as
             fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
@@ -104,9 +106,10 @@ class R2:
         """The fit that competes with methods on voxels: it is made, whatever they predict."""
         return replace(self, steps=self.planned_steps) if self.by_content else self
 
-    def for_trial(self, share: float) -> Self:
-        """The fit alone, of this share of the rows."""
-        return replace(self.as_candidate().for_part(share, 1.0), finish=0)
+    def for_trial(self, share: float, of_steps: float) -> Self:
+        """The fit alone, of this share of the rows, with this share of the steps."""
+        steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
+        return replace(self.for_part(share, 1.0), steps=steps, finish=0)
 
     @property
     def finish_sweeps(self) -> int:
@@ -161,6 +164,9 @@ class R2:
             rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
         fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return fit_costs(self, geometry, grid)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians

@@ -25,7 +25,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
-from recon.splatting.finish import best_candidate, finish
+from recon.splatting.finish import Candidates, finish, judged
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
@@ -254,7 +254,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
     """Fit the line integrals of a problem; see `R2`.
 
     Where the length of the fit is not given, views held out tell whether it predicts better than voxels do. If not, it
-    is a short one, and its volume is that of the better prior on voxels, see `finish.best_candidate`.
+    is a short one, and its volume is that of the better prior on voxels, see `finish.judged`.
 
     Raises:
         ValueError: for a problem that the method cannot be fitted to.
@@ -288,16 +288,22 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
     return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last))
 
 
+def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
+    """What a fit, and methods on voxels, leave of views held out."""
+
+    def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
+        share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]
+        return run_fit(method.for_trial(share, of_steps), part, watched)
+
+    return judged(problem, method.fit, control, short)
+
+
 def _candidate(method: FitMethod, views: _Views, control: RunControl, decide: Decisions) -> int:
     """Which of the methods on voxels predicts views held out best; their number: the fit. The prior is then decided."""
-
-    def short(part: ReconProblem, watched: RunControl) -> Reconstruction:
-        share = part.geometry.detector_shape[0] / views.all_geometry.detector_shape[0]
-        return run_fit(method.for_trial(share), part, watched)
-
-    at, prior = best_candidate(views.fitted, method.fit, control, short)
-    decide.preset(prior)
-    return at
+    tried = trials_of(method, views.fitted, control)
+    decide.preset(tried.prior)
+    residuals = [math.inf if each is None else float(each.mean()) for each in (tried.smooth, tried.patches, tried.fit)]
+    return int(np.argmin(residuals)) if min(residuals) < math.inf else len(_ON_VOXELS)
 
 
 def _started(
@@ -407,7 +413,7 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
     then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
     warnings.warn(
-        f"{method.seconds:.3g} s do not suffice for the start of the fit, which takes about {needed:.3g} s: "
+        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
         f"{then if factor > 1 else 'it ends late'}",
         stacklevel=2,
     )

@@ -23,7 +23,7 @@ from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
 from recon.base.slabs import bands_of, slices_of
 from recon.base.volume import Grid
-from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, nanoseconds, ray_by_ray
+from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # filtered at a time
@@ -191,12 +191,6 @@ def fbp_memory(views: int, cols: int) -> int:
     """Approximate bytes that FBP of slices [cols, cols] takes beside projections and volume: a plan and one block."""
     samples, cells = round(1.4 * cols), (round(1.25 * cols) + 64) ** 2
     return 64 * views * (cols + 2 * samples) + 16 * views * samples + 64 * cells + 4 * 32 * 16 * 8 * cols
-
-
-def fbp_nanoseconds(views: int, cols: int, slices: int) -> float:
-    """Time of FBP of so many slices [cols, cols], on the machine of docs/notes/performance.md."""
-    response = partial(ramp, pixel_pitch=1.0, filter="hann")
-    return min(nanoseconds(views, cols, (cols, cols), slices, response)) * -(-slices // SLICES)
 
 
 def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:

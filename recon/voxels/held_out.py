@@ -1,16 +1,17 @@
 """Views held out: how strengths, priors and methods are chosen, and the trials that judge them.
 
 One of eight views is held out. Each candidate makes a volume from the others, on some rows, and its residual of each
-view held out is measured. A strength and the method of `auto` are those of the least residual. Where a candidate is
-simpler and cheaper than another, they are compared view by view, since views differ more than candidates do: of those
-within one standard error of the best, the simplest is taken.
+view held out is measured. The candidate of the least mean residual is taken. Two candidates are compared view by view
+where a search, or a trial fit, may end before all has been tried: views differ more than candidates do.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from recon.base.arrays import F32, F64, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.noise_balance import NoiseBalance, determined
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
@@ -32,9 +33,11 @@ _ERRORS = 1.0  # standard errors of the difference, up to which two candidates p
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-_SWEEPS, _SUBSETS, _TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
+TRIAL_SWEEPS, SUBSETS, TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels, and a shell of hardly any noise, take 6 to 9
-CHOICE_SWEEPS = 4 * _SWEEPS
+TRIALS = 4
+"""Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
+CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
 _ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
@@ -42,18 +45,6 @@ _AIR = 0.03  # of the largest line integral: columns below see air
 _BESIDE = 0.05  # of the width of the matter: air that trials see on either side
 _NARROWER = 0.9  # of the columns: wider matter is not worth a cut
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
-
-
-def simplest(residuals: Sequence[F64]) -> int:
-    """Which candidate to take, by residuals [view held out] of each, from the simplest to the most costly one.
-
-    The first whose residuals exceed those of the best by no more than one standard error of the mean difference.
-    """
-    best = min(residuals, key=lambda residual: float(residual.mean()))
-    alike = (
-        n for n, residual in enumerate(residuals) if residual is best or not beyond_chance(residual - best, _ERRORS)
-    )
-    return next(alike)
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
@@ -240,7 +231,9 @@ def choose_weight(
     def chosen() -> list[float]:
         balance = NoiseBalance.of(problem, start, modelled)
         judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
-        preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
+        # The search begins higher where views leave much undetermined: there the noise asks for too little of a prior.
+        first = balance.first * 2.0 ** -round(math.log2(determined(problem.projector.geometry)))
+        preferred = None if judge is None else preferred_strength(judge.of_weight, first, alike_of(problem))
         if judge is None or preferred is None:
             return [balance.first, balance.noise]
         judge.keep("weight", preferred)
@@ -250,6 +243,20 @@ def choose_weight(
     return NoiseBalance(first, noise[0]) if noise else first
 
 
+class WideViews(NamedTuple):
+    """The rows of a trial with all columns, air beside the sample, too: a fit of narrower views is a poorer one.
+
+    Attributes:
+        cols: those of the trial.
+        seen: makes the problem of the views that are not held out.
+        unseen: the geometry of those that are.
+    """
+
+    cols: slice
+    seen: Callable[[], VoxelProblem]
+    unseen: Geometry
+
+
 class HeldOutTrial:
     """Volumes of a slab from seven of eight views, judged by the others.
 
@@ -257,19 +264,26 @@ class HeldOutTrial:
         problem: of the slab.
         start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
         unseen: the views held out.
+        wide: both with all columns.
+        direct: the first volume is FBP.
+        smooth: the volume of total variation that predicts these best, of those made so far.
     """
 
-    def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
+    def __init__(
+        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, wide: WideViews, direct: bool
+    ) -> None:  # fmt: skip
         self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
-        self._subsets = Subsets.of(problem, _SUBSETS)
-        self._ended = False
+        self.wide, self.direct = wide, direct
+        self._subsets = Subsets.of(problem, SUBSETS)
+        self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
+        self.smooth: F32 | None = None
 
     @classmethod
-    def of(cls, problem: VoxelProblem, air: bool = False) -> HeldOutTrial | None:
+    def of(cls, problem: VoxelProblem) -> HeldOutTrial | None:
         """The trial of the rows with most matter; of a cone of those in the middle.
 
-        Columns of air far beside the sample are left out, unless `air`: a fit of narrower views is a poorer one.
+        Columns of air far beside the sample are left out.
 
         None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
         `problem.trial_goes_on` ends it.
@@ -281,9 +295,7 @@ class HeldOutTrial:
         if not geometry.is_cone:
             rows = busiest_rows(images, TRIAL_ROWS)
             views, box = slab_of(geometry, grid, rows.start, rows.stop)
-            narrow = None if air else columns_of_matter(views, box, images[:, rows])
-            cols, views, box = narrow or (slice(None), views, box)
-            return cls._of_rows(problem, rows, views, box, cols)
+            return cls._of_rows(problem, rows, views, box, columns_of_matter(views, box, images[:, rows]))
         if geometry.detector_shape[0] <= TRIAL_ROWS:
             return cls._of_rows(problem, slice(0, geometry.detector_shape[0]), geometry, grid)
         middle = middle_of_cone(geometry, grid, images, TRIAL_ROWS)
@@ -291,9 +303,10 @@ class HeldOutTrial:
 
     @classmethod
     def _of_rows(
-        cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, cols: slice = slice(None)
-    ) -> HeldOutTrial | None:
-        def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
+        cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid,
+        matter: tuple[slice, Geometry, Grid] | None = None,
+    ) -> HeldOutTrial | None:  # fmt: skip
+        def of_views(chosen: NDArray[np.intp], cols: slice, views: Geometry, box: Grid) -> VoxelProblem:
             def cut(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, cols, rows])
 
@@ -307,14 +320,18 @@ class HeldOutTrial:
                 decide=Decisions(),
             )
 
-        seen, unseen = (of_views(some) for some in split_views(views))
+        cols, narrow, narrow_box = matter or (slice(None), views, box)
+        seen, unseen = (of_views(some, cols, narrow, narrow_box) for some in split_views(views))
         if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
             return None
         first = seen.filtered("hann")
+        direct = first is not None
         if first is None:  # no direct method takes these views
-            depth, height, width = box.shape
+            depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
-        return cls(seen, np.maximum(first, 0, out=first), unseen)
+        others, judges = split_views(views)
+        wide = WideViews(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
+        return cls(seen, np.maximum(first, 0, out=first) if direct else first, unseen, wide, direct)
 
     def _go_on(self, sweep: int, residual: float) -> bool:
         self._ended = self._ended or not self.problem.trial_goes_on()
@@ -336,13 +353,18 @@ class HeldOutTrial:
         self._known[prior, preferred.strength] = preferred.residuals
 
     def of_weight(self, weight: float) -> F64:
-        """`residuals` of total variation with this weight."""
-        return self.residuals_of("weight", weight, self.with_weight)
+        """`residuals` of total variation with this weight; the best volume of all is kept as `smooth`."""
+        if ("weight", weight) not in self._known:
+            volume = self.with_weight(weight)
+            residuals = self._known["weight", weight] = self.residuals(volume)
+            if residuals.mean() < self._least:
+                self.smooth, self._least = volume, float(residuals.mean())
+        return self._known["weight", weight]
 
     def with_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""
         return self.made(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=_SWEEPS, tv_steps=_TV_STEPS
+            part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
         ))  # fmt: skip
 
     def made(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:

@@ -100,7 +100,11 @@ class NoiseBalance:
         return self.value
 
 
+def determined(geometry: Geometry) -> float:
+    """The views over those that determine a slice, π / 2 a column; at most 1."""
+    return min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
+
+
 def _by_views(geometry: Geometry) -> float:
     """Factor on the noise by the number of views."""
-    complete = geometry.n_views / (math.pi / 2 * geometry.detector_shape[1])
-    return 1 + _MANY_VIEWS * min(max(complete / _HALF - 1, 0.0), 1.0)
+    return 1 + _MANY_VIEWS * min(max(determined(geometry) / _HALF - 1, 0.0), 1.0)

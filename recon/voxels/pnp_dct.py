@@ -16,6 +16,8 @@ from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
 STEPS = 5
 """Steps towards the views between two thresholds."""
+TRIAL_STEPS = 15
+"""Steps of a trial of patches, three rounds."""
 
 _PULL = 0.03  # of the largest eigenvalue of AᵀWA
 _FALL = 0.8  # of the threshold, from round to round

@@ -20,7 +20,7 @@ from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
 
-_ROUNDS, _ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
+POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,15 +110,15 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     """
     geometry, slices = projector.geometry, projector.grid.shape[0]
     alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
-    if alike and slices > _ROWS:
-        some, grid = geometry.rows(0, _ROWS), projector.grid
+    if alike and slices > POWER_ROWS:
+        some, grid = geometry.rows(0, POWER_ROWS), projector.grid
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
-        box = replace(grid, shape=(_ROWS, *grid.shape[1:]), centre=centre)
+        box = replace(grid, shape=(POWER_ROWS, *grid.shape[1:]), centre=centre)
         projector = Projector(some, box)
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf
-    for _ in range(_ROUNDS):
+    for _ in range(POWER_ROUNDS):
         image = projector.forward_lines(x)
         if weight is not None:
             image *= weight

@@ -23,7 +23,6 @@ from recon.axis_by_views import axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
-from recon.run_time import Extent
 from recon.voxels.fdk import fdk
 from tests.beamline.cli.small_scan import beamline
 
@@ -153,11 +152,11 @@ def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
 def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen = list[Extent]()
-    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or (7.0, 7.0))
+    seen = list[tuple[Geometry, Grid]]()
+    monkeypatch.setattr(estimate, "costs_of", lambda method, parts, decided: seen.extend(parts))
     found = beamline("recon", str(scan), "-m", "sirt", "-o", str(tmp_path / "out.h5"), "--dry-run")
     assert found.exit_code == 0 and "40 x 48 x 48 voxels by sirt, from 90 views" in found.stdout, found.output
-    geometry = seen[0].geometry
+    geometry = seen[0][0]
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--dry-run", "--memory", "1M")
     assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr

@@ -29,14 +29,14 @@ from beamline.storage.readers.wrapped import (
     PartsSource,
     TurnedSource,
     UnsignedSource,
-    has_wrapped,
+    type_wrapped,
 )
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
-_SHORT = "i1", "i2"  # signed types that cameras' counts do not fit
+_SIGNED = "i1", "i2", "i4"  # types that cameras' counts may not fit
 _LOOKED_AT = 3  # frames of a kind, for counts that wrapped
 _PIXELS = 2**27  # of a frame whose rows are all looked at
 REGISTRY = (  # modules in this folder, asked in this order
@@ -132,8 +132,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         if options.earlier:
             base = _of_parts(options.earlier, base)
         series = base
-        if base.dtype.str[1:] in _SHORT and any(has_wrapped(images) for images in _some_of_each_kind(base)):
-            base = UnsignedSource(base)
+        if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
+            base = UnsignedSource(base, dtype)
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
@@ -187,6 +187,14 @@ def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any]
             "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
         )
     return np.zeros((1, *base.shape), base.dtype), np.ones((1, *base.shape), base.dtype)
+
+
+def _unsigned_type(source: ScanSource) -> np.dtype[Any] | None:
+    """The type without a sign of counts that wrapped, which holds all of them; None: none has."""
+    looked_at = [(images, type_wrapped(images)) for images in _some_of_each_kind(source)]
+    dtype = max((each for _, each in looked_at if each is not None), key=lambda each: each.itemsize, default=None)
+    fits = dtype is not None and all(images.max() <= np.iinfo(dtype).max for images, _ in looked_at)
+    return dtype if fits else None
 
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:

@@ -20,7 +20,7 @@ from beamline.storage.readers.nexus_places import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.stacks import dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
-from beamline.storage.readers.wrapped import has_wrapped, unsigned
+from beamline.storage.readers.wrapped import type_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
 Images = Path | str | NDArray[Any]
@@ -122,5 +122,6 @@ def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) 
 
 def _stack(images: NDArray[Any], name: str) -> NDArray[Any]:
     require_real(images.dtype, name)
-    images = unsigned(images) if has_wrapped(images) else images
+    if (dtype := type_wrapped(images)) is not None:
+        images = unsigned(images, dtype)
     return images[None] if images.ndim == 2 else images

@@ -29,6 +29,7 @@ UNREADABLE = (
     zlib.error,
     MemoryError,
 )
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
 
 class Complaints(logging.Handler):
@@ -61,6 +62,14 @@ def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
         if claimed > min(most, PACKED * stored):
             raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
         return np.asarray(tif.asarray(key=slice(None)) if pages_one_by_one(tif) else tif.asarray())
+
+
+def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of what `read_image` gives, by the heads of its pages. ValueError where they tell no type."""
+    first = tif.series[0]
+    if first.dtype is None:
+        raise ValueError("its pixels are of an unknown type")
+    return ((len(tif.pages), *first.shape) if pages_one_by_one(tif) else first.shape), first.dtype
 
 
 def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import re
 import zipfile
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.image_names import angles_of, kinds_of, without_angle
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image, refuse_volume
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import FrameKind
 
@@ -72,8 +73,8 @@ class TiffSeriesSource(ScanSource):
             self.exposures = np.full(len(self._files), np.nan)
             some = order[:: len(order) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
-            self.shape = samples[-1].shape[0], samples[-1].shape[1]
-            self.dtype = np.result_type(*(image.dtype for image in samples))
+            self.shape = samples[-1][0]
+            self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         except BaseException:
             self.close()
@@ -153,18 +154,21 @@ class TiffSeriesSource(ScanSource):
         except (*UNREADABLE, RuntimeError) as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
-    def _readable(self, names: list[str], at_least: int = 0) -> list[NDArray[Any]]:
-        """The images of these files that can be read; DataError where they are fewer than `at_least`.
+    def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
+        """Shape and type of the images of these files that can be read, by their heads; DataError where they are fewer
+        than `at_least`.
 
         Of many bytes the first ones: to tell their type takes no more.
         """
-        images, failed, looked = list[NDArray[Any]](), list[UnreadableError](), 0
+        images, failed, looked = list[tuple[tuple[int, int], np.dtype[Any]]](), list[UnreadableError](), 0
         for name in names:
             if images and looked > _LOOKED:
                 break
             looked += self._size(name)
             try:
-                images.append(self._image(name))
+                with self._tiff(name) as tif:
+                    shape, dtype = image_of(tif)
+                images.append((self._require_grey(name, shape, dtype), dtype))
             except UnreadableError as error:
                 failed.append(error)
         if len(images) < at_least:
@@ -184,12 +188,16 @@ class TiffSeriesSource(ScanSource):
             image = read_image(io.BytesIO(content), LARGEST_IMAGE)
         except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
-        if image.size == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
-        if image.ndim != 2:
-            raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
-        require_real(image.dtype, f"{name} in {self.path}")
+        self._require_grey(name, image.shape, image.dtype)
         return image
+
+    def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
+        if not shape or math.prod(shape) == 0:
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
+        if len(shape) != 2:
+            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
+        require_real(dtype, f"{name} in {self.path}")
+        return shape
 
 
 def _open_zip(path: Path) -> zipfile.ZipFile:

@@ -15,7 +15,7 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
-UNPACKED, _READ = 2**30, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
+UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
 class WrappedSource(ScanSource):
@@ -144,44 +144,46 @@ class TurnedSource(WrappedSource):
 class UnsignedSource(WrappedSource):
     """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
 
-    def __init__(self, base: ScanSource) -> None:
+    def __init__(self, base: ScanSource, dtype: np.dtype[Any]) -> None:
         super().__init__(base)
-        self.dtype = _unsigned(base.dtype)
+        self.dtype = dtype
         self._update()
 
     @property
     def attributes(self) -> Attributes:
-        return {**self._base.attributes, "pixels": f"{self._base.dtype} that wrapped, read as {self.dtype}"}
+        return {**self._base.attributes, "pixels": f"int{8 * self.dtype.itemsize} that wrapped, read as {self.dtype}"}
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        return unsigned(self._base.read(frames, rows))
+        return unsigned(self._base.read(frames, rows), self.dtype)
 
 
-def unsigned(images: NDArray[Any]) -> NDArray[Any]:
-    """The same bits as counts without a sign."""
-    return images.view(_unsigned(images.dtype))
+def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """The same lowest bits as counts without a sign."""
+    if images.dtype.itemsize == dtype.itemsize:
+        return images.view(dtype)
+    return (images & np.iinfo(dtype).max).astype(dtype)
 
 
-def _unsigned(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    return np.dtype(f"{dtype.byteorder}u{dtype.itemsize}")
-
-
-def has_wrapped(images: NDArray[Any]) -> bool:
-    """Whether signed integers [..., col] are counts whose sign bit is one of the counts.
+def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
+    """The unsigned type of signed integers [..., col] whose sign bit is one of the counts; None: they are as they are.
 
     Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
     without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
-    noise around 0, or marks pixels without data by one value, has not wrapped.
+    noise around 0, or marks pixels without data by one value, has not wrapped. Four bytes may hold those of two, where
+    a file has views as int16 beside flats as uint16.
     """
-    if images.dtype.kind != "i" or images.dtype.itemsize > 2 or images.shape[-1] < 2:
-        return False
+    if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
+        return None
     negative = images[images < 0]
     if negative.size == 0 or negative.min() == negative.max():
-        return False
-    signed, plain = (
-        np.abs(np.diff(some.astype(np.int32), axis=-1)).sum(dtype=np.int64) for some in (images, unsigned(images))
-    )
-    return bool(plain < signed or (plain == signed and np.median(images) < 0))
+        return None
+    size = images.dtype.itemsize
+    if size == 4 and images.min() >= -(2**15) and images.max() < 2**16:
+        size = 2
+    dtype = np.dtype(f"{images.dtype.byteorder}u{size}")
+    counts = unsigned(images, dtype)
+    signed, plain = (np.abs(np.diff(some.astype(np.int64), axis=-1)).sum() for some in (images, counts))
+    return dtype if plain < signed or (plain == signed and np.median(images) < 0) else None
 
 
 class PartsSource(WrappedSource):

@@ -23,10 +23,11 @@ _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _LEAST_SEEN = 8  # views, and columns: fewer do not show a turn
-_OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
-_FACTORS = 1 / 0.9, 2.0, 0.5  # of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses
-_PAIRS = 6  # of views that are stated half a turn apart, which are compared
-_UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
+OTHER = 0.08  # of half a turn, and two steps: nearer ones are alike where the view that is sought was spoilt
+# Of degrees in what is stated: gradians; twice or half the turn, by a gear or its pulses; minutes; thousandths of rad.
+_FACTORS = 1 / 0.9, 2.0, 0.5, 60.0, 1000 * math.pi / 180
+PAIRS = 6  # of views that are stated half a turn apart, which are compared
+UNLIKE = 4.0  # times as different: twice as far from one another, since a small turn shows by its square
 _FINE = 90  # of the range of angles: neighbours that tell how much a small turn changes a view
 _AROUND = 9  # views about the best of some that are looked at
 _PARTS = 4  # steps to a column in which mirror images are moved
@@ -141,11 +142,16 @@ def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Views:
-    """Coarse line integrals of some views of a scan, each read once."""
+class CoarseViews:
+    """Coarse line integrals of views of a scan, each read once.
+
+    Attributes:
+        rows: views that have an angle and can be read, in the order of the file.
+    """
 
     source: ScanSource
     light: ViewLight
+    rows: NDArray[np.int64]
 
     def depth(self, row: int) -> NDArray[np.float64]:
         """[row, col] of a view."""
@@ -183,6 +189,20 @@ class _Views:
         return float(curve.min()) / len(pairs)
 
 
+def coarse_views(source: ScanSource) -> CoarseViews | None:
+    """The views of a scan, if it has enough of them, and their line integrals are known."""
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    kinds = set(source.image_key.tolist())
+    counts = source.quantity == "counts"
+    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+        return None
+    if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
+        return None
+    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
+    views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
+    return CoarseViews(source, light, views) if views.size >= _LEAST_SEEN else None
+
+
 def angles_seen(source: ScanSource) -> Iterator[Finding]:
     """Views that are stated half a turn apart are mirror images (a whole turn: alike), and no others are.
 
@@ -190,19 +210,10 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
     does: a round sample shows no angle.
     """
-    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
-    kinds = set(source.image_key.tolist())
-    counts = source.quantity == "counts"
-    if source.quantity == "unknown" or source.emission is not None or source.shifts is not None:
+    seen = coarse_views(source)
+    if seen is None:
         return
-    if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
-        return
-    light = ViewLight.of(source, reference_groups(source).good() if counts else None)
-    views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
-    if views.size < _LEAST_SEEN:
-        return
-    views = views[np.argsort(source.angles[views], kind="stable")]
-    seen = _Views(source, light)
+    views = seen.rows[np.argsort(source.angles[seen.rows], kind="stable")]
     some = some_of(views, VIEWS)
     some = some[[seen.lit(row) for row in some.tolist()]]
     degrees = np.degrees(source.angles)
@@ -213,7 +224,7 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     chosen = np.flatnonzero(beside != some)
     if not chosen.size:
         return
-    chosen = chosen[np.unique(np.linspace(0, chosen.size - 1, _PAIRS).astype(int))]
+    chosen = chosen[np.unique(np.linspace(0, chosen.size - 1, PAIRS).astype(int))]
     near = float(np.median([seen.unlike([(int(some[at]), int(beside[at]))], False) for at in chosen]))
     for mirrored in (True, False) if source.cone is None else (False,):
         turn = _turn_seen(seen, views, some, degrees, near, mirrored)
@@ -232,7 +243,7 @@ class _Turn:
 
 
 def _turn_seen(
-    seen: _Views, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], near: float,
+    seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], near: float,
     mirrored: bool,
 ) -> _Turn | None:  # fmt: skip
     """Views that are alike after another angle than they should be, where those that should be are not.
@@ -245,7 +256,7 @@ def _turn_seen(
     stated = _stated_apart(seen, views, some, degrees, period)
     # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
     off = min((seen.unlike([pair], mirrored) for pair in stated), default=np.inf)
-    if off < 2 * _UNLIKE * near or (not stated and not mirrored):
+    if off < 2 * UNLIKE * near or (not stated and not mirrored):
         return None
     first, last = int(some[0]), int(some[-1])
     ends = [(first, row) for row in some[some.size // 4 :].tolist()] + [
@@ -257,21 +268,19 @@ def _turn_seen(
     around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
     best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
-    if abs(turned - period) <= max(_OTHER * period, 2 * step) or not best < min(
-        2 * near, off / _UNLIKE, usual / _UNLIKE
-    ):
+    if abs(turned - period) <= max(OTHER * period, 2 * step) or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
 
 def _stated_apart(
-    seen: _Views, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], period: float
+    seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], degrees: NDArray[np.float64], period: float
 ) -> list[tuple[int, int]]:
     """A few pairs of views with light that are stated to be so many degrees apart, within a step."""
     partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
     step = min(float(np.median(np.diff(np.unique(degrees[views])))), float(np.ptp(degrees[some])) / (some.size - 1))
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= step)
-    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, _PAIRS).astype(int))] if pairs.size else pairs
+    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, PAIRS).astype(int))] if pairs.size else pairs
     return [(int(some[at]), int(partner[at])) for at in pairs if seen.lit(int(partner[at]))]
 
 

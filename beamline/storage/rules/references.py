@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import block_means, check_block, digest
-from beamline.monitor.flats_with_sample import flats_like_views, mass_missing, nothing_seen
+from beamline.monitor.flats_with_sample import brighter_in_places, flats_like_views, mass_missing, nothing_seen
 from beamline.monitor.odd_references import without_odd
 from beamline.monitor.references import Group, JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource, read_known
@@ -37,12 +37,14 @@ class ReferenceGroups:
         judged: the verdict on each group, the darks first.
         alike: views differ from good flats and from one another by less than this line integral, by noise alone; None:
             they show something.
+        brighter: views are brighter than good flats in places, by this line integral; None: nowhere.
     """
 
     darks: tuple[Frames, ...]
     flats: tuple[Frames, ...]
     judged: tuple[JudgedGroup, ...]
     alike: float | None = None
+    brighter: float | None = None
 
     def good(self) -> ReferenceGroups:
         """The groups without a fault; for a kind without a good group, all groups."""
@@ -110,17 +112,19 @@ def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGrou
         )
         witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
-    alike = None
+    alike, brighter = None, None
     if lit and not any(group.faults for group in found[len(dark) :]):
         alike = nothing_seen(lit, dark, views)
         fault = flats_like_views(lit, dark, views) or mass_missing(lit, dark, views)
         if fault is not None:
             found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
+        else:
+            brighter = brighter_in_places(lit, dark, views)
     found = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in found]
     judged = sorted([*found, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
     rows = [np.array(group.rows, np.int64) for group in judged]
     n = sum(group.kind is FrameKind.DARK for group in judged)
-    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged), alike)
+    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged), alike, brighter)
 
 
 def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
@@ -156,6 +160,14 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
             f"No view looked at differs from the flats by more than noise (line integrals below {groups.alike:.2g}). "
             "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
             "all sides.",
+        )
+    if groups.brighter is not None:
+        yield Finding(
+            "warning",
+            "bad-references",
+            f"In places the views are brighter than the flats by {groups.brighter:.2g} of line integral, though a "
+            "sample only takes light. Was the sample, or something else, in the beam for the flats, or did the beam "
+            "change its shape?",
         )
     lacking = groups.lacking()
     alike: dict[tuple[FrameKind, tuple[str, ...], bool], list[int]] = {}

@@ -22,6 +22,7 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import LookedEnoughError, ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
@@ -32,7 +33,7 @@ from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_transmission
+from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 
 __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 
@@ -256,15 +257,15 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and look_like_counts(views):
+    if source.quantity == "line_integrals" and source.emission is None and (said := _not_line_integrals(source)):
+        yield Finding("error", "quantity", said)
+    elif source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
             "pixels",
             f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
             "If so, say --quantity counts, with darks and flats.",
         )
-    elif source.quantity == "line_integrals" and source.emission is None and _falls(source):
-        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
     elif source.quantity == "counts" and _rises(source):
         yield Finding("error", "quantity", _RISES)
 
@@ -393,6 +394,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_known,
     angles_spread,
     angles_seen,
+    angles_in_order,
     quantity_said,
     references_present,
     exposures_agree,
@@ -411,6 +413,15 @@ _FALLS = (
     "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
     "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
 )
+_DIMS = (
+    "The values are far above 1 at the edges of the views and fall where the sample is, as counts do; line integrals "
+    "are 0 there and rise. Say --quantity counts, with --darks and --flats; or divide them by the light without a "
+    "sample, and say --quantity transmission."
+)
+_NEGATIVE = (
+    "The values are 0 at the edges of the views and below 0 where the sample is, as the logarithm of transmission is; "
+    "line integrals are its negative, and rise there. Write them with the other sign."
+)
 _RISES = (
     "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
     "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
@@ -421,6 +432,18 @@ def _falls(source: ScanSource) -> bool:
     """The views look like transmission, which real numbers can be."""
     views = _sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
+
+
+def _not_line_integrals(source: ScanSource) -> str:
+    """What the values are that are given as line integrals; "": they may be."""
+    views = _sample(source, FrameKind.PROJECTION, SHAPES)
+    if views is None:
+        return ""
+    if source.dtype.kind == "f" and look_like_transmission(views):
+        return f"Transmission is given as line integrals. {_FALLS}"
+    if look_like_light(views):
+        return f"Light is given as line integrals. {_DIMS}"
+    return _NEGATIVE if look_negative(views) else ""
 
 
 def _rises(source: ScanSource) -> bool:

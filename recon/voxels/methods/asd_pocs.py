@@ -13,12 +13,15 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
+from recon.voxels.direct import direct_work
 from recon.voxels.iterative import run_iterative
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
+from recon.voxels.work import on_volume, ordered_sweeps, sweep
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,12 @@ class AsdPocs:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        descent = on_volume("slope", grid, self.tv_steps) + on_volume("pass", grid, self.tv_steps + 6)
+        sweeps = ordered_sweeps(geometry, grid, self.iterations, geometry.n_views)
+        seen = (1 + self.iterations) * 0.5 * sweep(geometry, grid)  # projected without an adjoint
+        return Costs({self.name: direct_work(geometry, grid) + sweeps + seen + (self.iterations - 1) * descent})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 5.1, 7.8, 4.1 * weighted, filtered=True)

@@ -15,9 +15,11 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
+from recon.voxels.work import on_volume, sweep
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,10 @@ class Cgls:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        step = sweep(geometry, grid) + on_volume("pass", grid, 3)
+        return Costs({self.name: (1 + self.iterations) * step})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)

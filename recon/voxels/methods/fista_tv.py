@@ -11,12 +11,14 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.voxels.held_out import HeldOutTrial, choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
+from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
 from recon.voxels.sweeps import interleaved
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory, largest_eigenvalue
+from recon.voxels.work import fista_sweeps, ordered_sweeps, power_rounds, weight_choice
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,12 @@ class FistaTv:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        start = ordered_sweeps(geometry, grid, 1, 9) + power_rounds(geometry, grid, subsets_of(geometry, self.subsets))
+        sweeps = fista_sweeps(geometry, grid, self.iterations, self.subsets, self.tv_steps)
+        choice = weight_choice(geometry, grid) if self.tv_weight is None else Work()
+        return Costs({self.name: start + sweeps}, choice)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 7.3, 3.0, 4.8 * weighted, filtered=True)

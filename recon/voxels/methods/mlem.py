@@ -12,8 +12,10 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.voxels.emission import Emission, mlem, passes_by_halves
 from recon.voxels.voxel_problem import iterative_memory
+from recon.voxels.work import on_volume, sweep
 
 UPDATES = 200
 """Of the volume, by all subsets: where counts do not say how many, and the most that they may ask for."""
@@ -49,6 +51,9 @@ class Mlem:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return Costs({self.name: _work(self, geometry, grid, 1)})
+
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return _memory(geometry, grid, weighted, 1)
 
@@ -74,6 +79,9 @@ class Osem:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return Costs({self.name: _work(self, geometry, grid, min(self.subsets, geometry.n_views))})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return _memory(geometry, grid, weighted, min(self.subsets, geometry.n_views))
@@ -126,3 +134,10 @@ def _emission(problem: ReconProblem) -> Emission:
 
 def _memory(geometry: Geometry, grid: Grid, weighted: bool, subsets: int) -> int:
     return iterative_memory(geometry, grid, 4.5 + subsets, 5.2 + 4 / subsets, 1.1 * weighted)
+
+
+def _work(method: Mlem | Osem, geometry: Geometry, grid: Grid, subsets: int) -> Work:
+    """At most: counts held out may ask for fewer iterations, after as many trials on halves of them."""
+    iterations = method.most_iterations if method.iterations is None else method.iterations
+    step = sweep(geometry, grid) + on_volume("pass", grid, 6 * subsets)
+    return (iterations + 0.5) * step

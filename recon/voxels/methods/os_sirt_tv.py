@@ -11,12 +11,14 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.voxels.held_out import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
+from recon.voxels.work import on_volume, ordered_sweeps, weight_choice
 
 _SETTLED = 3 / 8  # of the sweeps: with 3 of 40, a cement in a cone of 50 views ended 5.6 dB lower
 
@@ -82,6 +84,11 @@ class OsSirtTv:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        step = on_volume("tv", grid, self.tv_steps + 1) + on_volume("pass", grid, 2 * self.momentum)
+        work = ordered_sweeps(geometry, grid, self.iterations, self.subsets) + self.iterations * step
+        return Costs({self.name: work}, weight_choice(geometry, grid) if self.tv_weight is None else Work())
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 8.1 + 2 * self.momentum, 5.2, 8.2 * weighted, filtered=True)

@@ -3,37 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
+    TRIAL_SWEEPS,
+    TRIALS,
     HeldOutTrial,
     alike_of,
     choose_weight,
     is_coarse,
     preferred_strength,
-    simplest,
 )
-from recon.voxels.iterative import prior_decisions, run_iterative, solve
+from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
-from recon.voxels.projector import Projector
+from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
+from recon.voxels.work import patch_choice, patch_steps
 
 _FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
-TRIAL_STEPS = 15
-"""Steps of a trial of patches, three rounds."""
 TRIAL_THRESHOLD = 1.6
 """Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
@@ -69,7 +67,7 @@ class PnpDct:
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
-        return CHOICE_SWEEPS + CHOICE_SWEEPS // 4 + 4 * TRIAL_STEPS
+        return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * TRIAL_STEPS
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
@@ -100,6 +98,12 @@ class PnpDct:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        first = FistaTv().costs(geometry, grid)
+        choice = patch_choice(geometry, grid) if self.patch_threshold is None else Work()
+        work = first.volumes[FistaTv.name] + patch_steps(geometry, grid, self.iterations)
+        return Costs({self.name: work}, first.choice + choice)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         nz, ny, nx = grid.shape
@@ -133,18 +137,18 @@ def choose_patches(
     """
 
     def chosen() -> list[float]:
-        first = _FIRST * noise_of_volume(problem)
-        judge = None if isinstance(weight, NoiseBalance) or first == 0 else trial()
-        if judge is None or isinstance(weight, NoiseBalance):
+        judge = None if isinstance(weight, NoiseBalance) else trial()
+        first = _FIRST * noise_of_volume(problem if judge is None else judge.problem)
+        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
-        smooth = judge.with_weight(weight)
+        smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
         found = preferred_strength(partial(residuals_of_patches, judge, smooth), first, alike_of(problem))
         if found is None:
             return [first, 0]
         judge.keep("patches", found)
         if is_coarse(problem.projector.geometry, problem.projector.grid):
             return [found.strength, 0]
-        return [found.strength, simplest([judge.of_weight(weight), found.residuals])]
+        return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
@@ -157,29 +161,3 @@ def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
         return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
 
     return trial.residuals_of("patches", strength, made)
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """The search for a prior as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is."""
-
-    iterations: int = 1
-
-    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        trial = cache(partial(HeldOutTrial.of, problem))
-        choose_patches(problem, choose_weight(problem, x, modelled=False, trial=trial), trial)
-        return x
-
-
-def prior_of(problem: ReconProblem, on_trial: Callable[[], bool]) -> dict[str, Sequence[Any]]:
-    """Decisions on both priors by views held out, for any method on voxels; none where nothing can be held out.
-
-    Args:
-        on_trial: called after each sweep of a trial; true ends them, without a decision.
-    """
-    data, known = masked(problem.projections, problem.use.weights)
-    if not data.any():
-        return {}
-    decide, projector = Decisions(problem.seed), Projector(problem.geometry, problem.grid)
-    solve(_Prior(), projector, data, weight=known, on_trial=on_trial, decide=decide)
-    return prior_decisions(decide.made)

@@ -12,8 +12,10 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
+from recon.base.work import Costs
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
+from recon.voxels.work import ordered_sweeps
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,9 @@ class Sirt:
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return Costs({self.name: ordered_sweeps(geometry, grid, self.iterations, 1)})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 4.5, 3.2, 3.1 * weighted)

@@ -157,6 +157,33 @@ def test_a_plan_that_is_aborted_in_a_pause_ends_the_scan_in_order(engine: Any, t
             assert file["entry/progress/status"].asstr()[()] == "stopped"
 
 
+def test_a_plan_that_ends_while_its_kickoff_begins_leaves_no_scan_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from beamline.bluesky import devices
+
+    asked, ended, usual = threading.Event(), threading.Event(), devices.ScanStream
+
+    def slow(*given: Any) -> Any:
+        asked.set()
+        ended.wait(10)
+        return usual(*given)
+
+    instrument = FakeInstrument()
+    scan = devices.TomoScan(ran.small(), tmp_path, instrument=instrument.connected())
+    monkeypatch.setattr(devices, "ScanStream", slow)
+
+    async def plan() -> None:
+        begun = asyncio.ensure_future(scan.kickoff().task)
+        await asyncio.to_thread(asked.wait, 10)
+        await scan.unstage()
+        ended.set()
+        await asyncio.gather(begun, return_exceptions=True)
+
+    asyncio.run(plan())  # which waits for its threads
+    assert not [what for what in instrument.log if "arm" in what or "move" in what]
+
+
 def test_lost_frames_fail_the_plan_and_are_named(engine: Any, tmp_path: Path) -> None:
     from beamline.bluesky.devices import TomoScan, fly
 

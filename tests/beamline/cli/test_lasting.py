@@ -44,3 +44,10 @@ def test_a_command_that_leaves_a_file_ends_as_ever(tmp_path: Path, redirected: s
 def test_a_reader_that_wants_no_more_is_no_error(folder: Path) -> None:
     done = _run(folder, "| head -c 1; exit ${PIPESTATUS[0]}", "config", "schema")
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_only_results_reach_stdout_by_whatever_way_a_plug_in_writes() -> None:
+    code = "import os, sys; from beamline.cli.main import Outputs; outputs = Outputs(); os.write(1, b'one '); "
+    code += "print('two', file=sys.__stdout__, flush=True); os.system('echo three'); print('{}'); outputs.lost()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr.split()) == ("{}\n", ["one", "two", "three"])

@@ -235,3 +235,16 @@ def test_an_interruption_that_went_through_a_text_of_code_has_its_exit_code_too(
     """Python would end by the signal: dataclasses, which modules make while they load, run such texts."""
     code = "import beamline.cli.main as m; m.main = lambda **_: exec('raise KeyboardInterrupt'); m.run()"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == INTERRUPTED
+
+
+def test_under_a_limit_of_addresses_compiled_kernels_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`recon` chooses them only while numba is not there: else a fit compiles for minutes, and LLVM may end it."""
+    loaded: list[str] = []
+
+    def imported(name: str) -> SimpleNamespace:
+        loaded.append(name)
+        return SimpleNamespace(njit=lambda function: function)
+
+    monkeypatch.setattr(module, "import_module", imported)
+    module._load_early(("scipy.linalg",))
+    assert loaded == ["recon", "scipy.linalg", "numba"]

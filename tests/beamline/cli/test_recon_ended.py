@@ -144,7 +144,7 @@ def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
         return run(method, problem, control)
 
     monkeypatch.setattr(direct.Fbp, "run", interrupted)
-    monkeypatch.setattr(budget, "measured_speeds", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
+    monkeypatch.setattr(budget, "speeds_of", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
     result = beamline("recon", "scan.h5", "--budget", "20s", "-o", "out.h5", "--no-report")
     assert result.exit_code == 0, result.output
     assert "as soon as there is a volume" in result.stderr and "stopped early" not in result.output

@@ -17,7 +17,7 @@ from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
 from beamline.projections.selection import Selection
 from beamline.storage.volumes.files import opened_volume
-from recon.run_time import RunTime
+from recon.base.work import CLOCK, Costs, Work
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
 
@@ -169,13 +169,13 @@ def test_what_does_not_go_together_is_one_line(
 def test_a_dry_run_states_the_memory_and_writes_nothing(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its seconds are predicted from small fits, which tests/recon/test_series_time.py has."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("beamline.reconstruct.estimate.series_seconds", lambda *_: RunTime(70.0, 30.0))
+    costs = Costs({"rest": Work.of(CLOCK, 30.0), "moving": Work.of(CLOCK, 70.0)})
+    monkeypatch.setattr("recon.series.series_costs", lambda *_: costs)
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
-    assert "about 30 s where the data shorten it" in done.output.splitlines()[-1]
+    assert "about 1.17 min; about 30 s where the data end it early" in done.output.splitlines()[-1]
     told = json.loads(beamline("recon", str(scan), "--time", "2", "--dry-run", "--json").stdout)
     assert (told["seconds"], told["least_seconds"]) == (70.0, 30.0) and told["time"] > 1e9  # of the event
     assert not left(tmp_path)

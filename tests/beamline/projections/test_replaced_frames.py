@@ -77,6 +77,39 @@ def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(
     assert found > clean(3, 3, scale) - 0.5
 
 
+def _flats_through(blocks: Blocks, what: str) -> np.ndarray:
+    """Flats [3, row, col] through what is no view of the sample."""
+    lines = line_integrals()[10]
+    match what:
+        case "displaced":
+            lines = np.roll(lines, 14, axis=1)
+        case "another sample":
+            lines = 2.5 * np.roll(lines, -9, axis=1)
+        case "a blade":
+            lines = np.repeat(np.where(np.arange(len(lines)) < 5, 0.7, 0.0)[:, None], lines.shape[1], axis=1)
+    return blocks.taken(np.repeat(lines[None], 3, axis=0))
+
+
+@pytest.mark.parametrize("what", ["displaced", "another sample", "a blade"])
+@pytest.mark.parametrize("at", [0, 1])
+def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine(what: str, at: int) -> None:
+    """The flats differ from one another, and not those are left out that look more like views."""
+    blocks = Blocks(2, 3)
+    blocks.of(FLAT)[at][:] = _flats_through(blocks, what)
+    found, (line,) = decibels(blocks.source())
+    rows = (3, 5) if at == 0 else (6 + VIEWS + 3, 6 + VIEWS + 5)
+    assert line.startswith(f"The flats {rows[0]}-{rows[1]}: in places the views are brighter")
+    assert found > clean(2, 3) - 0.5
+
+
+def test_a_group_of_flats_alone_with_the_sample_beside_its_place_is_doubted() -> None:
+    """It reaches the edge of the field, so that its mass is not known."""
+    blocks = Blocks(1, 3)
+    blocks.of(FLAT)[0][:] = _flats_through(blocks, "displaced")
+    _, told = decibels(blocks.source())
+    assert any(line.startswith("In places the views are brighter than the flats by") for line in told)
+
+
 def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """They look like one view, and other views outshine them in places."""
     blocks = Blocks(1, 3)

@@ -62,6 +62,22 @@ def test_it_is_never_taken_as_line_integrals(tmp_path: Path, beam: float) -> Non
     assert "Say --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
 
 
+@pytest.mark.parametrize(
+    ("values", "dtype", "told"),
+    [
+        (100 * np.exp(-LINES), np.float32, "far above 1 at the edges"),
+        (6e4 * np.exp(-LINES), np.uint16, "far above 1 at the edges"),
+        (-LINES, np.float32, "below 0 where the sample is"),
+    ],
+    ids=["percent", "counts", "the other sign"],
+)
+def test_light_and_the_other_sign_are_never_taken_as_line_integrals(
+    tmp_path: Path, values: np.ndarray, dtype: Any, told: str
+) -> None:
+    with pytest.raises(DataError, match=told):
+        lines(stack(tmp_path / "t.tif", values, dtype), quantity="line_integrals")
+
+
 def test_line_integrals_are_never_taken_as_transmission(tmp_path: Path) -> None:
     path, shape = stack(tmp_path / "p.tif", LINES), (1, *SCAN.shape)
     np.testing.assert_array_equal(lines(path, quantity="line_integrals"), LINES.astype(np.float32))

@@ -74,7 +74,7 @@ def _spend(
 
 
 def _as_fast_as(monkeypatch: pytest.MonkeyPatch, *speeds: float) -> None:
-    monkeypatch.setattr(module, "measured_speeds", lambda *_: Speeds(*speeds))
+    monkeypatch.setattr(module, "speeds_of", lambda *_: Speeds(*speeds))
 
 
 @pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
@@ -128,7 +128,7 @@ def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said
         clock.time += 7.0
         return Speeds(432.0, 50.0, 3.0, 10.0, 9.0)
 
-    monkeypatch.setattr(module, "measured_speeds", slow)
+    monkeypatch.setattr(module, "speeds_of", slow)
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
     binned_pixels = done.choice.binning
@@ -151,7 +151,7 @@ def test_what_the_measuring_has_used_up_joins_no_pixels_to_save_milliseconds(
         clock.time += 15.0
         return Speeds(8e-3, 2.0, 0.1, 0.5, 0.2)
 
-    monkeypatch.setattr(module, "measured_speeds", slow)
+    monkeypatch.setattr(module, "speeds_of", slow)
     warned: list[str] = []
     done = _spend(prepared, budget, clock, warned)
     assert (done.choice.method, done.choice.binning) == ("fbp", 1)

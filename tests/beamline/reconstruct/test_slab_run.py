@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakSet
@@ -27,7 +28,9 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers import partial_volume
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
-from recon.run_time import Extent, RunTime
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.base.work import CLOCK, Costs, Work
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -159,25 +162,26 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
     with monkeypatch.context() as patch:
         interrupt_after(patch, 1)
         beamline(*FISTA, "-o", "out.h5")
-    before, seen = Path("out.partial.h5").read_bytes(), list[Extent]()
+    before, seen = Path("out.partial.h5").read_bytes(), list[tuple[list[int], bool]]()
 
-    def seconds(method: object, extent: Extent, now: object) -> RunTime:
-        seen.append(extent)
-        return RunTime(float(extent.slices), extent.slices / 2)
+    def costs(method: object, parts: Sequence[tuple[Geometry, Grid]], decided: bool) -> Costs:
+        seen.append(([grid.shape[0] for _, grid in parts], decided))
+        slices = sum(seen[-1][0])
+        return Costs({"a": Work.of(CLOCK, slices), "b": Work.of(CLOCK, slices / 2)})
 
-    monkeypatch.setattr(estimate, "run_seconds", seconds)
+    monkeypatch.setattr(estimate, "costs_of", costs)
     all_of_it, rest = (
         json.loads(beamline(*FISTA, "-o", "out.h5", *more, "--dry-run", "--json").stdout.splitlines()[-1])
         for more in ((), ("--resume", "out.partial.h5"))
     )
     assert (rest["seconds"], rest["least_seconds"]) == (100, 50)
     assert (all_of_it["slabs"], all_of_it["done"], rest["slabs"], rest["done"]) == (3, 0, 2, 32)
-    assert sorted([*seen[1].heights, 44]) == sorted(seen[0].heights) == [44, 44, 56]
-    assert seen[1].decided and not seen[0].decided
+    assert sorted([*seen[1][0], 44]) == sorted(seen[0][0]) == [44, 44, 56]
+    assert seen[1][1] and not seen[0][1]
     assert all_of_it["scratch"] - rest["scratch"] == rest["output"] and rest["memory"] == all_of_it["memory"]
     said = beamline(*FISTA, "--resume", "out.partial.h5", "--dry-run").stdout
     assert "2 slabs that are left; 32 of 96" in said
-    assert "at most about 1.67 min; about 50 s where the data end the fit early, reading" in said
+    assert "about 1.67 min; about 50 s where the data end it early, reading" in said
     other = beamline(*FISTA, "--rows", "0:80", "--resume", "out.partial.h5", "--dry-run")
     assert other.exit_code == 5 and "is of 96 slices, this volume has 80" in other.stderr
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}

@@ -13,7 +13,8 @@ import pytest
 from beamline.reconstruct import estimate
 from beamline.reconstruct.slabs import Needs
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.run_time import Extent
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from tests.beamline.cli.small_scan import beamline, left
@@ -189,13 +190,13 @@ def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over
 ) -> None:
     """Views of 200 rows; the later half stands 100 rows higher."""
     Path("poses.csv").write_text("view,shift_row_px\n" + "".join(f"{n},{100 * (n >= 30)}\n" for n in range(60)))
-    seen = list[Extent]()
-    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or (7.0, 7.0))
+    seen = list[tuple[Geometry, Grid]]()
+    monkeypatch.setattr(estimate, "costs_of", lambda method, parts, decided: seen.extend(parts))
     dry = ("recon", "scan.h5", "-m", "sirt", "--dry-run", "-o", "out.h5")
     stepped = beamline(*dry, "--poses", "poses.csv")
-    assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1].heights == [300], stepped.output
+    assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1][1].shape[0] == 300, stepped.output
     assert beamline(*dry, "--exposure-arc", "4:2").exit_code == 0
-    assert seen[-1].geometry.width.arc == pytest.approx(np.radians(4)) and seen[-1].geometry.skew != 0
+    assert seen[-1][0].width.arc == pytest.approx(np.radians(4)) and seen[-1][0].skew != 0
 
 
 def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import tracemalloc
 import zipfile
 import zlib
 from pathlib import Path
@@ -34,6 +36,21 @@ def test_a_member_of_a_zip_and_angles_without_end(tmp_path: Path, monkeypatch: p
         packed.writestr("p_000.tif", bytes(10_001))
     with pytest.raises(DataError, match="at most 10 kB are read"):
         open_scan(tmp_path / "s.zip")
+
+
+def test_info_unpacks_no_large_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wrapped, "UNPACKED", 2**22)
+    image = io.BytesIO()
+    tifffile.imwrite(image, np.zeros((4096, 4096), np.uint16))
+    with zipfile.ZipFile(tmp_path / "s.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
+        for n in range(2):
+            packed.writestr(f"p_{n:03d}.tif", image.getvalue())
+    tracemalloc.start()
+    facts = described.describe(tmp_path / "s.zip")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert facts["shape"] == (4096, 4096) and facts["dtype"] == "uint16"
+    assert peak < 1.2 * image.tell()  # zipfile unpacks 16 MB and copies them, to find the end of a member
 
 
 def test_info_does_not_wait_for_frames_that_each_cost_the_whole_file(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -137,3 +139,40 @@ def test_a_disk_that_fails_says_what_became_of_the_file(
     if kept:
         assert finish(path)
     assert path.read_bytes() == (expected if kept else OLD)
+
+
+WAYS: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo if os.name == "posix" else Path.mkdir,
+    "link": lambda place: place.symlink_to("s.h5"),
+    "endless": lambda place: place.symlink_to("/dev/zero"),
+    "huge": lambda place: (place.touch(), os.truncate(place, 2**33))[1],
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes take rights on Windows")
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_put_in_the_place_of_a_journal_is_not_waited_for(path: Path, way: str) -> None:
+    WAYS[way](journal_of(path))
+    for work in (pending, finish):
+        with pytest.raises(DataError, match="cannot be read"):
+            work(path)
+    assert path.read_bytes() == OLD
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "[]", '{"length": 1}', '{"length": true, "ranges": []}', '{"length": -1, "ranges": []}', "[" * 10**5, "\xff",
+        '{"length": 9, "ranges": [[-1, 1, 1]]}', '{"length": 9, "ranges": [[1.5, 1, 1]]}',
+        f'{{"length": {"9" * 5000}}}',
+        '{"length": 9, "ranges": [[1, 1]]}', '{"length": 9, "ranges": 7}',
+    ],
+    ids=range(11),
+)  # fmt: skip
+def test_a_journal_of_other_words_is_damaged(path: Path, head: str) -> None:
+    content = head.encode("latin1") + b"\nabc"
+    mark = f"{journal._FORMAT} {hashlib.sha256(content).hexdigest()}\n"
+    journal_of(path).write_bytes(mark.encode() + content)
+    with pytest.raises(DataError, match="is damaged, or of another file"):
+        finish(path)
+    assert path.read_bytes() == OLD

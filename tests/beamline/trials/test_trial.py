@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.trials.plans import Timed, plan, plan_in_equal_time, seconds_left, work
+from beamline.trials.plans import Timed, plan, plan_in_equal_time, trials_left, work
 from beamline.trials.trial import QUALITIES, Outcome, Trial
 from recon.base.method import BoundedMethod
-from recon.methods import by_name, names
+from recon.methods import by_name, names_of_one_volume
 
-METHODS = names()
+METHODS = names_of_one_volume()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
@@ -60,8 +60,8 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
     started = [Timed(trials[0], 2.0 + seconds, seconds)] * done
-    assert (seconds_left(started, [trials[0]] * 3) is None) == (not done)
-    assert not done or seconds_left(started, [trials[0]] * 3) == pytest.approx(3 * (2.0 + seconds))
+    assert (trials_left(started, [trials[0]] * 3) is None) == (not done)
+    assert not done or trials_left(started, [trials[0]] * 3) == pytest.approx(3 * (2.0 + seconds))
 
 
 def test_full_tries_more_than_quick() -> None:
@@ -99,14 +99,14 @@ def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start:
     left = [replace(base, settings={**base.settings, "steps": 100 * k}) for k in range(1, n + 1)]
     expected = n * start + speed * sum(map(work, left))
     one = Timed(base, start + speed * work(base), speed * work(base))
-    assert seconds_left([one], left) == pytest.approx(expected)
-    assert seconds_left([one], []) == 0
-    assert seconds_left([], left) is None
+    assert trials_left([one], left) == pytest.approx(expected)
+    assert trials_left([one], []) == 0
+    assert trials_left([], left) is None
     # Of a method never tried nothing better is known than the mean of what was.
     done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
     other = Trial("method", "fbp", 60)
-    assert seconds_left(done, [other]) == pytest.approx(3 + 6)
-    assert seconds_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
+    assert trials_left(done, [other]) == pytest.approx(3 + 6)
+    assert trials_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
 
 
 def test_where_the_time_of_a_trial_went() -> None:

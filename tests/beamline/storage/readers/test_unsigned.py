@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
-from beamline.storage.readers.wrapped import has_wrapped
+from beamline.storage.readers.wrapped import type_wrapped
 from beamline.storage.rules.validate import validate
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders
@@ -31,10 +31,10 @@ def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: 
     rng = np.random.default_rng(seed)
     views = beam * np.exp(-SCAN.line_integrals()[:6]) + noise * rng.standard_normal((6, *SCAN.shape))
     counts = views.clip(0, 65535).astype(np.uint16)
-    assert has_wrapped(counts.astype(">u2").view(">i2").astype(sign))
+    assert type_wrapped(counts.astype(">u2").view(">i2").astype(sign)) == np.dtype(sign).str.replace("i", "u")
     flat = np.full((2, 4, 40), beam) + noise * rng.standard_normal((2, 4, 40))
     if np.unique(flat.astype(np.uint16)).size > 1 and flat.max() < 65535:
-        assert has_wrapped(flat.astype(np.uint16).view(np.int16))
+        assert type_wrapped(flat.astype(np.uint16).view(np.int16)) == np.uint16
 
 
 @given(beam=st.floats(0, 32_000), noise=st.floats(0, 300), marked=st.sampled_from([None, -1, -32768]))
@@ -45,8 +45,7 @@ def test_counts_that_fit_are_left_as_they_are(beam: float, noise: float, marked:
     if marked is not None:
         counts = np.maximum(counts, 0)
         counts[:, 1, 10:20] = marked
-    assert not has_wrapped(counts)
-    assert not has_wrapped(counts.astype(np.int32)) and not has_wrapped(counts.astype(np.float32))
+    assert all(type_wrapped(counts.astype(kind)) is None for kind in (np.int16, np.int32, np.float32))
 
 
 @pytest.mark.parametrize("kind", ["tiff", "exchange", "nxtomo"])
@@ -79,3 +78,23 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 1)), flats)
         np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
     assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
+
+
+@pytest.mark.parametrize("flats_as", [np.uint16, np.int16])
+def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path, flats_as: type) -> None:
+    counts = SCAN.counts(40_000)
+    flats = np.full((2, *SCAN.shape), 40_100, np.uint16)
+    flats[:, 0, 0] += 5
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"], file["exchange/data_white"] = counts.view(np.int16), flats.view(flats_as)
+        file["exchange/data_dark"] = np.full((2, *SCAN.shape), 100, np.uint16)
+        file["exchange/theta"] = np.degrees(SCAN.angles)
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION)), counts)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.FLAT)), flats)
+
+
+def test_counts_beyond_four_signed_bytes_are_told() -> None:
+    counts = (SCAN.counts(40_000).astype(np.uint32) * 60_000).view(np.int32)
+    assert type_wrapped(counts) == np.uint32

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_seen
 from beamline.storage.rules.finding import Finding
 from tests.beamline.array_source import ArraySource
@@ -88,3 +89,41 @@ def test_a_rod_about_an_axis_far_from_the_middle_is_never_refused(axis: float) -
 
 def test_a_round_sample_shows_no_angle() -> None:
     assert told(scan(ROUND, turn(180, 90), turn(200, 90))) == []
+
+
+def ordered(source: ArraySource) -> list[Finding]:
+    return list(angles_in_order(source))  # type: ignore[arg-type]
+
+
+EVEN = turn(180, 64)
+PASSES = np.concatenate([np.arange(at, 64, 4) for at in range(4)])
+MIXED = np.random.default_rng(1).permutation(64)
+GOLDEN = np.arange(64) * 111.246
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER], ids=["within", "wider"])
+@pytest.mark.parametrize(
+    ("true", "stated", "severity", "says"),
+    [
+        (EVEN, np.roll(EVEN, 10), "error", "stated at 177.188 and 0 degrees, look alike"),
+        (EVEN, EVEN[PASSES], "error", "not in the order of the frames"),
+        (EVEN, EVEN[MIXED], "error", "not in the order of the frames"),
+        (EVEN, np.r_[EVEN[:54], np.zeros(10)], "error", "not in the order of the frames"),
+        (EVEN, np.where(np.arange(64) == 40, 0, EVEN), "warning", "not between those of their neighbours: frames 48"),
+        (EVEN[PASSES], EVEN, "warning", "look more alike than neighbours"),
+    ],
+    ids=["shifted", "passes stated", "shuffled", "end not written", "one wrong", "passes taken"],
+)
+def test_angles_in_another_order_than_the_frames_are_told(
+    balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], severity: str, says: str
+) -> None:
+    (hit,) = ordered(scan(balls, true, stated))
+    assert hit.severity == severity and says in hit.message
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
+@pytest.mark.parametrize(
+    "true", [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, turn(720, 128), np.r_[EVEN, EVEN]]
+)
+def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: NDArray[np.float64]) -> None:
+    assert ordered(scan(balls, true, true)) == []

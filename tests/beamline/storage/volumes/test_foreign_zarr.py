@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -159,12 +160,23 @@ def test_a_coarser_scale_that_is_no_volume_is_left_out(tmp_path: Path, coarser: 
     assert (finest.shape, finest.coarser) == (SHAPE, ())
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf, True, "1"])
 def test_a_voxel_without_a_size_is_refused(tmp_path: Path, scale: float) -> None:
     _write(tmp_path / "v.zarr", 2, "zstd")
     group = pytest.importorskip("zarr").open_group(str(tmp_path / "v.zarr"))
     said = group.attrs["multiscales"]
-    said[0]["datasets"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [1.0, 1.0, str(scale)]}]
+    said[0]["datasets"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [1.0, 1.0, scale]}]
     group.attrs["multiscales"] = said
-    with pytest.raises(DataError, match="expected lengths above 0"):
+    with pytest.raises(DataError, match=r"expected (lengths above 0|3 numbers)"):
         open_zarr(tmp_path / "v.zarr")
+
+
+@pytest.mark.parametrize("key", ["shape", "chunk_shape"])
+def test_true_is_no_side_of_a_volume(tmp_path: Path, key: str) -> None:
+    """The library of the format takes it for 1."""
+    pytest.importorskip("zarr", reason="extra oracle").create_array(str(tmp_path), shape=(4, 4, 4), dtype="u1")
+    head = (tmp_path / "zarr.json").read_text()
+    (tmp_path / "zarr.json").write_text(re.sub(rf'("{key}": \[\s*)4', r"\1true", head, count=1))
+    assert (tmp_path / "zarr.json").read_text() != head
+    with pytest.raises(DataError, match=rf"its {key} is \[True, 4, 4\]; expected whole numbers"):
+        open_zarr(tmp_path)

@@ -1,0 +1,112 @@
+"""The order of angles: views that are stated side by side look alike, and no others do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, coarse_views
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.references import VIEWS, some_of
+
+_FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
+_SINGLE = 0.1  # of the views: so few wrong angles are named one by one
+_MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
+
+
+def angles_in_order(source: ScanSource) -> Iterator[Finding]:
+    """No frames that follow one another look alike where they are stated far apart, and others stated side by side do
+    not.
+
+    A list in another order than the frames shows so, and a single angle that is wrong. Only one view of many tells of
+    it where the list is shifted, so the places are looked at where angles jump.
+    """
+    seen = coarse_views(source)
+    if seen is None:
+        return
+    rows, degrees = seen.rows, np.degrees(source.angles[seen.rows]) % 360
+    order = np.argsort(degrees, kind="stable")
+    gaps = np.diff(degrees[order])
+    if not (gaps > 0).any():
+        return
+    step = float(np.median(gaps[gaps > 0]))
+    jumps = np.flatnonzero(_apart(np.diff(degrees)) > _FAR * step)
+    beside = np.flatnonzero((gaps <= _NEXT * step) & (np.abs(np.diff(order)) > 1))
+    far = _lit(seen, [(int(rows[at]), int(rows[at + 1])) for at in jumps])
+    near = _lit(seen, [(int(rows[order[at]]), int(rows[order[at + 1]])) for at in beside])
+    if far and near:
+        unlike_far, unlike_near = (
+            float(np.median([seen.unlike([pair], False) for pair in pairs])) for pairs in (far, near)
+        )
+        if unlike_near > UNLIKE * unlike_far:
+            yield _in_another_order(source, rows, jumps, far[0], near[0])
+            return
+    yield from _alike_elsewhere(seen, rows[order])
+
+
+def _apart(turned: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Degrees between directions, of differences of angles."""
+    return np.abs((turned + 180) % 360 - 180)
+
+
+def _lit(seen: CoarseViews, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """A few of the pairs of frames, evenly spread, with light."""
+    some = sorted({round(i * (len(pairs) - 1) / (PAIRS - 1)) for i in range(PAIRS)}) if pairs else []
+    return [pairs[i] for i in some if all(seen.lit(row) for row in pairs[i])]
+
+
+def _stated(source: ScanSource, pair: tuple[int, int]) -> str:
+    first, second = np.degrees(source.angles[list(pair)])
+    return f"frames {pair[0]} and {pair[1]}, stated at {first:.6g} and {second:.6g} degrees,"
+
+
+def _in_another_order(
+    source: ScanSource, rows: NDArray[np.int64], jumps: NDArray[np.int64], far: tuple[int, int], near: tuple[int, int]
+) -> Finding:
+    text = f"{_stated(source, far)} look alike, and {_stated(source, near)} do not. "
+    text = text[0].upper() + text[1:]
+    single = np.intersect1d(jumps, jumps + 1)  # between two jumps
+    if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * rows.size:
+        wrong = ", ".join(f"{row} ({np.degrees(source.angles[row]):.6g})" for row in rows[single[:5]].tolist())
+        text += f"The angles of {single.size} views are not between those of their neighbours: frames {wrong}. "
+        return Finding("warning", "angle-order", text + "Give the right ones with --angles FILE (degrees, one a line).")
+    text += (
+        "The angles are not in the order of the frames. Give one for each projection, in their order, with "
+        "--angles FILE."
+    )
+    return Finding("warning" if source.plan else "error", "angle-order", text)
+
+
+def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Finding]:
+    """Most views look more like one that is far from them than like their neighbours; rows by ascending angle."""
+    some = some_of(rows, VIEWS)
+    some = some[[seen.lit(row) for row in some.tolist()]]
+    if some.size < PAIRS:
+        return
+    degrees = np.degrees(seen.source.angles[some]) % 360
+    apart = _apart(degrees - degrees[:, None])
+    is_far = apart > max(OTHER * 180, 2 * float(np.median(np.diff(degrees))))
+    unlike = np.full(is_far.shape, np.inf)
+    for i, j in np.argwhere(np.triu(np.ones_like(is_far), 1)).tolist():
+        unlike[i, j] = unlike[j, i] = seen.unlike([(int(some[i]), int(some[j]))], False)
+    if not is_far.any():
+        return
+    usual, beside = float(np.median(unlike[is_far])), np.diagonal(unlike, 1)
+    neighbours = np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
+    elsewhere = np.where(is_far, unlike, np.inf).min(axis=1)
+    odd = elsewhere < np.minimum(neighbours, usual / UNLIKE)
+    if odd.mean() < _MOST:
+        return
+    first = int(np.flatnonzero(odd)[0])
+    pair = int(some[first]), int(some[np.where(is_far[first], unlike[first], np.inf).argmin()])
+    text = _stated(seen.source, pair)
+    yield Finding(
+        "warning",
+        "angle-order",
+        f"{text[0].upper()}{text[1:]} look more alike than neighbours, as {odd.sum()} of {some.size} views looked at "
+        "do. Unless the sample is symmetric, the angles are not in the order of the frames, or the sample went round "
+        "more often than they state.",
+    )
