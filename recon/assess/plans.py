@@ -89,7 +89,7 @@ class Preset:
     share: float
 
 
-PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Preset(400, 1.0), "best": Preset(1500, 2.0)}
+PRESETS: dict[Quality, Preset] = {"preview": Preset(125, 0.5), "standard": Preset(400, 1.0), "best": Preset(1500, 1.0)}
 
 
 @dataclass(frozen=True)

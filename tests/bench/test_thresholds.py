@@ -51,7 +51,7 @@ CONSTANTS = [
     Constant("the same of a fit's trial", "recon.splatting.finish.TRIAL_THRESHOLD", 1.0),
     Constant("falling threshold of patches", "recon.voxels.pnp_dct._FALL", 1.0),
     Constant("pull towards sparse patches", "recon.voxels.pnp_dct._PULL", 0.3),
-    Constant("a trial fit is looked at early", "recon.splatting.finish._FIRST_SHARE", 1.0),
+    Constant("a trial fit is looked at early", "recon.splatting.finish.FIRST_SHARE", 1.0),
     Constant("a fit too far behind ends", "recon.splatting.finish._FAR", math.inf),
     Constant("single wild rays of a finish", "recon.splatting.finish._WILD", math.inf),
     Constant("rings off the views of a finish", "recon.splatting.finish.ring_offsets", lambda *_: np.float32(0)),
