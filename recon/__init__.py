@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import reconstruct
     from recon.registration import register_energies
-    from recon.series import TimedViews, TimedVolumes, fit_series
+    from recon.series import TimedViews, TimedVolumes, TimeSeries, fit_series
     from recon.share_fit import fit_share
     from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
@@ -93,6 +93,7 @@ __all__ = [
     "SaxNerf",
     "Sirt",
     "StreamingFit",
+    "TimeSeries",
     "TimedViews",
     "TimedVolumes",
     "Volume",
@@ -123,7 +124,7 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.registration",
-    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
+    **dict.fromkeys(("TimeSeries", "TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
     "EnergyViews": "recon.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
     "fit_share": "recon.share_fit",

@@ -47,6 +47,7 @@ REGISTRY: dict[str, MethodEntry] = {
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
     "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
+    "series": MethodEntry("recon.series", "TimeSeries", compared=False),
     "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
     "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
     "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),
@@ -54,12 +55,19 @@ REGISTRY: dict[str, MethodEntry] = {
 
 DEFAULT = "r2"  # The default method
 
+IN_TIME = "series"  # The method of volumes in time
+
 BASELINE = "fbp"  # Reports compare all methods with this one
 
 
 def names() -> tuple[str, ...]:
     """Names of all methods; loads no module of ours."""
     return tuple(_entries())
+
+
+def names_of_one_volume() -> tuple[str, ...]:
+    """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
+    return tuple(name for name in names() if name != IN_TIME)
 
 
 def names_compared(emission: bool = False) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.view_weights import cone_weights, missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
+_IN_TIME = 12  # times these views, for methods of volumes in time
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 
 
@@ -60,7 +61,7 @@ def warm_up(
     method = method or R2()
     if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
         cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry)
+    data, views = toy_of(geometry, _IN_TIME if method.traits.in_time else 1)
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)
@@ -118,13 +119,16 @@ def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
         yield
 
 
-def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
+def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geometry]:
     """Line integrals [view, row, col] of a blob in four small views for which the same kernels run as for `geometry`.
 
-    The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around.
+    The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around. They
+    come so many `times`, one after the other.
     """
-    views = _views_like(geometry)
-    return project(_blob(views), views).numpy(), views
+    once = views = _views_like(geometry)
+    for _ in range(times - 1):
+        views = views.followed_by(once)
+    return np.tile(project(_blob(once), once).numpy(), (times, 1, 1)), views
 
 
 def _views_like(geometry: Geometry | None) -> Geometry:

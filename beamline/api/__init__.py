@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
     from beamline.api.reading import monitor, stream, volumes
     from beamline.api.reconstruction import ReconResult, reconstruct
-    from beamline.api.time_series import reconstruct_series
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
-    from beamline.reconstruct.time_series import TimeSeriesResult
 
 __all__ = [
     "BeamlineError",
@@ -39,11 +37,9 @@ __all__ = [
     "ScanVerdict",
     "Selection",
     "StopRequest",
-    "TimeSeriesResult",
     "connect",
     "monitor",
     "reconstruct",
-    "reconstruct_series",
     "scan",
     "stream",
     "to_stderr",
@@ -54,8 +50,6 @@ _LAZY = {
     **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reading"),
     **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
-    "TimeSeriesResult": "beamline.reconstruct.time_series",
-    "reconstruct_series": "beamline.api.time_series",
     "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }

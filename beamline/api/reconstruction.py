@@ -51,6 +51,7 @@ def reconstruct(
     Args:
         path: a scan file, or the folder of a run.
         method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
+            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`.
         rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.

@@ -19,7 +19,7 @@ from beamline.core.text import size
 from drivers import orca_quest
 from drivers.base.clock import SystemClock
 from recon.base.choices import N_GAUSSIANS, SIDE
-from recon.methods import by_name, names
+from recon.methods import by_name, names_of_one_volume
 
 if TYPE_CHECKING:
     from beamline.doctor.rate import Load, RateRow
@@ -183,7 +183,7 @@ def _rows() -> Iterator[VolumeRow]:
     from recon.bench import volume_rows
     from recon.splatting.r2 import R2
 
-    others = [by_name(name) for name in names()]
+    others = [by_name(name) for name in names_of_one_volume()]
     yield from volume_rows(time.perf_counter, [*map(R2, _STEPS), *(method() for method in others if method is not R2)])
 
 

@@ -218,6 +218,32 @@ _ALLOW_NEGATIVE = option(
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
+_IN_TIME = together(
+    option(
+        "--time",
+        "volumes",
+        owner=Owner("volumes"),
+        excludes={
+            **_FINISHED,
+            "axis_trials": "find the axis first: give --axis try without --time, then its column with --time",
+            "region": "a box is of one volume",
+            "truth": "a truth is compared with one volume",
+            "uncertainty": "error bars are of one volume",
+            "cluster": "volumes in time are not made in slabs",
+        },
+        type=click.IntRange(min=2),
+        metavar="N",
+        help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
+        "views. Each needs twelve views or more.",
+    ),
+    option(
+        "--moves/--no-moves",
+        owner=Owner("moves"),
+        needs=("volumes", "is of volumes in time: give --time N with it."),
+        default=None,
+        help="With --time: matter moves, or only its density changes. Default: what views held out prefer.",
+    ),
+)
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
 """The options of methods for every row of a table: length and start of the work."""
 equal_time = option(
@@ -327,6 +353,7 @@ method_options = together(
     _TV_WEIGHT,
     _PATCH_THRESHOLD,
     _ALLOW_NEGATIVE,
+    _IN_TIME,
     option(
         "--plain-splatting",
         owner=Owner("fit.rays.rectified", inverted=True),

@@ -66,7 +66,6 @@ class Declared(click.Option):
         owner: the methods that take it; None: it is not a method's.
         excludes: what does not go with it, by parameter name, and why.
         needs: another parameter, without which this one means nothing, and the end of the sentence that says so.
-        in_time: it goes with `recon --time`, too.
         of_one_call: it is of one scan or call, and never part of a recipe.
         repeated: the command line that repeats a call has it, too.
     """
@@ -77,24 +76,18 @@ class Declared(click.Option):
         owner: Owner | None = None,
         excludes: Mapping[str, str] | None = None,
         needs: tuple[str, str] | None = None,
-        in_time: bool = False,
         of_one_call: bool = False,
         repeated: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.owner, self.excludes, self.needs = owner, dict(excludes or {}), needs
-        self.in_time, self.of_one_call, self.repeated = in_time, of_one_call, repeated
+        self.of_one_call, self.repeated = of_one_call, repeated
 
 
 def option(*names: str, **facts: Any) -> Decorator:
     """`click.option` for a `Declared` one."""
     return click.option(*names, cls=Declared, **facts)
-
-
-def of_views(*names: str, **facts: Any) -> Decorator:
-    """An option that chooses or corrects views, which every method takes."""
-    return option(*names, in_time=True, **facts)
 
 
 def name_of(option: click.Option) -> str:
@@ -136,7 +129,7 @@ set_option = click.option(
     help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
 )
 json_option = option(
-    "--json", "as_json", is_flag=True, in_time=True, of_one_call=True, repeated=False,
+    "--json", "as_json", is_flag=True, of_one_call=True, repeated=False,
     help="Print one JSON event per line to stdout.",
 )  # fmt: skip
 dry_option = option(

@@ -27,7 +27,6 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import names_given, recipe_text, repeating
 from beamline.cli.recon_options import SHEET, recon_options
-from beamline.cli.recon_time import recon_series
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
@@ -38,7 +37,7 @@ from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT
+from recon.methods import DEFAULT, IN_TIME
 
 if TYPE_CHECKING:
     from beamline.reconstruct.axis_trials import AxisRange
@@ -69,9 +68,6 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
     context = click.get_current_context()
-    if values["volumes"] is not None:
-        recon_series(context, file, output, values)
-        return
     axes = None if isinstance(values["axis"], float | None) else values["axis"]
     slabs = values["resume"] if resumes_slabs(values["resume"]) else None
     method = _checked_method(context, method, axes, slabs)
@@ -115,7 +111,7 @@ def _checked_method(context: click.Context, method: str | None, axes: AxisRange 
     if method is None:
         of_a_method = {name for name, each in declared(context.command).items() if each.owner is not None}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
-        method = DEFAULT if of_fits else AUTO
+        method = IN_TIME if "volumes" in asked else DEFAULT if of_fits else AUTO
     refuse_contradictions(context.command, asked, {"axis_trials": "--axis try", "slabs": f"--resume {slabs}"})
     refuse_for_method(context, method, asked)
     for step in chosen_steps(values) if values["follow"] else ():

@@ -22,7 +22,6 @@ from beamline.cli.options import (
     volume_path,
 )
 from beamline.cli.recipe import config_option
-from beamline.cli.recon_time import time_options
 from beamline.cli.selection_options import selection_options
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.choices import AUTO
@@ -83,7 +82,6 @@ recon_options = together(
     selection_options,
     method_options,
     preset_option,
-    time_options,
     heading(METHOD),
     option(
         "--filter",
@@ -100,7 +98,7 @@ recon_options = together(
         help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
     ),
     heading(METHOD),
-    option("--seed", in_time=True, type=SEED, default=0, show_default=True, help="Seed of all random numbers."),
+    option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."),
     heading(OUTPUT),
     option(
         "--uncertainty",
@@ -120,7 +118,6 @@ recon_options = together(
     option(
         "-o",
         "--output",
-        in_time=True,
         of_one_call=True,
         metavar="PATH",
         callback=parsed(output_path),
@@ -129,7 +126,6 @@ recon_options = together(
     ),
     option(
         "--report/--no-report",
-        in_time=True,
         of_one_call=True,
         default=True,
         show_default=True,
@@ -168,7 +164,6 @@ recon_options = together(
     ),
     option(
         "--unfinished",
-        in_time=True,
         of_one_call=True,
         is_flag=True,
         help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
@@ -177,7 +172,6 @@ recon_options = together(
     option(
         "--memory",
         excludes=_IN_MEMORY,
-        in_time=True,
         metavar="SIZE",
         callback=parsed(memory_size),
         help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
@@ -235,7 +229,6 @@ recon_options = together(
         "--dry-run",
         "dry",
         excludes={"follow": "a scan that runs takes its own time", "budget": "it says the time itself", **_PICTURE},
-        in_time=True,
         of_one_call=True,
         repeated=False,
         is_flag=True,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import POSITIVE, of_views, option, parsed, together
+from beamline.cli.options import POSITIVE, option, parsed, together
 
 if TYPE_CHECKING:
     from beamline.projections.scan_statistics import LightAsked
@@ -19,42 +19,42 @@ underscored = parsed(lambda value: value.replace("-", "_"))
 """`line-integrals` on the command line becomes `line_integrals`."""
 
 scan_options = together(
-    of_views(
+    option(
         "--quantity",
         type=click.Choice(["counts", "transmission", "line-integrals"]),
         callback=underscored,
         help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
     ),
-    of_views(
+    option(
         "--horizontal-axis", is_flag=True, help="The rotation axis lies along the rows: turn frames by a quarter turn."
     ),
-    of_views("--angles", of_one_call=True, type=_PATH, help="Text file with one angle per line, degrees."),
-    of_views("--angle-rows", of_one_call=True, metavar="A:B", help="Lines of --angles that belong to the projections."),
-    of_views(
+    option("--angles", of_one_call=True, type=_PATH, help="Text file with one angle per line, degrees."),
+    option("--angle-rows", of_one_call=True, metavar="A:B", help="Lines of --angles that belong to the projections."),
+    option(
         "--darks",
         of_one_call=True,
         type=_PATH,
         help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file.",
     ),
-    of_views(
+    option(
         "--flats",
         of_one_call=True,
         type=_PATH,
         help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with flats, instead of those in the file.",
     ),
-    of_views(
+    option(
         "--data-path",
         metavar="DATASET",
         help="For an HDF5 file of any layout, or of several detectors: its projections [frame, row, col]: /raw/images.",
     ),
-    of_views("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
-    of_views("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
-    of_views(
+    option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
+    option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
+    option(
         "--angles-path",
         metavar="DATASET",
         help="For any HDF5 file: its angles, one for each projection or frame, in the unit that the dataset states.",
     ),
-    of_views(
+    option(
         "--angles-unit", type=click.Choice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."
     ),
 )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
-from beamline.cli.options import POSITIVE, of_views, parsed, together
+from beamline.cli.options import POSITIVE, option, parsed, together
 from beamline.cli.scan_options import scan_options
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
@@ -106,41 +106,41 @@ def _step_options() -> list[Option]:
     return [option for step in registered() for option in options_of(step).values()]
 
 
-def _of_step(option: Option) -> Callable[..., Any]:
+def _of_step(asked: Option) -> Callable[..., Any]:
     """An option of a step as an option of the command line."""
-    return of_views(
-        option.name,
-        type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if option.path else str,
-        callback=parsed(lambda value: option.parse(str(value))),
-        default=option.default,
-        show_default=option.default is not None,
-        metavar=option.metavar,
-        help=option.help,
+    return option(
+        asked.name,
+        type=click.Choice(asked.choices) if asked.choices else click.Path(path_type=Path) if asked.path else str,
+        callback=parsed(lambda value: asked.parse(str(value))),
+        default=asked.default,
+        show_default=asked.default is not None,
+        metavar=asked.metavar,
+        help=asked.help,
     )
 
 
 _BEFORE = (
     heading(DATA),
-    of_views(
+    option(
         "--views",
         default="all",
         show_default=True,
         metavar="SPEC",
         help="all | fixed:N | sector:A-B[:N] (degrees) | random:N[:SEED] | first:N | every:K",
     ),
-    of_views(
+    option(
         "--rows",
         callback=parsed(span),
         metavar="FIRST:END",
         help="Detector rows to use; the volume has one slice per row. Default: all.",
     ),
-    of_views(
+    option(
         "--cols",
         callback=parsed(span),
         metavar="FIRST:END",
         help="Detector columns to use, as if there were no others: --axis and messages count from FIRST. Default: all.",
     ),
-    of_views(
+    option(
         "--bin",
         "binning",
         type=click.IntRange(min=1),
@@ -148,7 +148,7 @@ _BEFORE = (
         show_default=True,
         help="Average blocks of N x N pixels.",
     ),
-    of_views(
+    option(
         "--axis",
         callback=parsed(column),
         metavar="PX|auto|try:A:B:STEP",
@@ -160,12 +160,12 @@ _BEFORE = (
 )
 _AFTER = (
     heading(DATA),
-    of_views(
+    option(
         "--pixel-size-um",
         type=POSITIVE,
         help="Pixel size at the sample (cone beam: on the detector). Default: as in the file.",
     ),
-    of_views(
+    option(
         "--cone",
         callback=parsed(distances),
         metavar="SOD:SDD",

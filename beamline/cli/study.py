@@ -20,7 +20,7 @@ from beamline.core.files import REPORT
 from beamline.trials.view_choices import STUDIES
 from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
-from recon.methods import BASELINE, DEFAULT, names
+from recon.methods import BASELINE, DEFAULT, names_of_one_volume
 
 
 @click.command(
@@ -34,7 +34,7 @@ from recon.methods import BASELINE, DEFAULT, names
     "-m",
     "--method",
     "methods",
-    type=click.Choice(names()),
+    type=click.Choice(names_of_one_volume()),
     multiple=True,
     default=(DEFAULT, BASELINE),
     show_default=True,

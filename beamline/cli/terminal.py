@@ -248,7 +248,13 @@ def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
     lines = [f"{'output':<10}{record.output}"]
     lines += [f"{'report':<10}{record.report}"] if record.report else []
-    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in record.grid.shape)} in {record.unit}")
+    shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
+    if len(seconds):
+        lines.append(
+            f"{'volumes':<10}{len(seconds)} of {shape} in {record.unit}, {seconds[0]:.4g} to {seconds[-1]:.4g} s"
+        )
+    else:
+        lines.append(f"{'volume':<10}{shape} in {record.unit}")
     lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
     lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
     lines += [f"{'next dB':<10}{record.next_decibel_text}"] if record.next_decibel_text else []

@@ -27,15 +27,15 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
-from recon.methods import names, names_compared
+from recon.methods import names_compared, names_of_one_volume
 
 
 def listed(value: str) -> tuple[str, ...]:
     """Names of methods, separated by commas. ValueError for another name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    unknown = [name for name in wanted if name not in names()]
+    unknown = [name for name in wanted if name not in names_of_one_volume()]
     if unknown:
-        raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
+        raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names_of_one_volume())}")
     return wanted
 
 
@@ -94,8 +94,8 @@ _OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each ene
     "--methods",
     callback=parsed(listed),
     metavar="A,B,...",
-    help=f"Methods to compare, of {', '.join(names())}. "
-    f"Default: all but {', '.join(name for name in names() if name not in names_compared())}; "
+    help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
+    f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
     "of an emission also mlem and osem.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")

@@ -45,6 +45,7 @@ class PreparedProjections:
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
         emission: the counts behind these views; None: the sample does not emit.
+        times: [view] s when each was exposed; None: no method asked for it.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -66,6 +67,7 @@ class PreparedProjections:
     held_out_ids: NDArray[np.int64] | None = None
     held_out_weights: NDArray[np.float32] | None = None
     emission: Emission | None = None
+    times: NDArray[np.float64] | None = None
     stretch: float = 1.0
 
     def stretched(self, volume: Volume) -> Volume:

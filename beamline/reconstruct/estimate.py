@@ -13,6 +13,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from recon.assess.time_model import duration_text
+from recon.base.method import volumes_of
 from recon.base.slabs import slabs_of
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
@@ -23,7 +24,7 @@ class Estimate:
     """The resources of a reconstruction.
 
     Attributes:
-        shape: of the volume [z, y, x].
+        shape: of the volume [z, y, x], or of volumes in time [time, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
         memory: bytes that will be used.
@@ -37,7 +38,7 @@ class Estimate:
 
     method: str
     views: int
-    shape: tuple[int, int, int]
+    shape: tuple[int, ...]
     at_once: int
     allowed: int
     memory: int
@@ -54,8 +55,10 @@ class Estimate:
         if self.done:
             in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
         how = in_slabs if self.scratch else "all at once"
+        *several, z, y, x = self.shape
+        what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
         return [
-            f"{'volume':<10}{' x '.join(str(n) for n in self.shape)} voxels by {self.method}, from {self.views} views",
+            f"{what}{z} x {y} x {x} voxels by {self.method}, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
             f"{'time':<10}{self._time()}",
@@ -90,7 +93,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
         shape = Grid.matching(geometry).shape
         slabs = missing = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
-        if not fits and geometry.is_cone:
+        if not fits and geometry.is_cone and not options.method.traits.in_time:
             raise DataError(
                 f"{source.path}: {options.method.name} would take {size(needs.at_once)}, {size(allowed)} of memory may "
                 "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
@@ -124,8 +127,9 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     times = 1 + options.uncertainty  # error bars take at most as long
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
     height = slabs[0].own.stop
+    of_all = shape if (several := volumes_of(needs.method)) == 1 else (several, *shape)
     return Estimate(
-        options.method.name, geometry.n_views, shape, needs.at_once, allowed,
+        options.method.name, geometry.n_views, of_all, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
         None if span is None else times * span.most, None if span is None else times * span.least,
     )  # fmt: skip

@@ -53,6 +53,9 @@ def judge(
     """
     judged = VolumeLooks(made, prepared, truth, target, context, sink, clock)
     judged.warnings.extend(context.warnings)
+    if made.series is not None:  # each view shows a volume of its own time
+        judged.metrics[made.method] = {"residual": made.series.residual, "seconds": made.seconds}
+        return judged
     judged.look_at_residual()
     judged.look_for_stray_mass()
     judged.warn(needles_warning(made, prepared.geometry))

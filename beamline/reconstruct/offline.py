@@ -36,6 +36,7 @@ from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
 from recon.base.method import (
@@ -47,6 +48,7 @@ from recon.base.method import (
     Reconstruction,
     RunControl,
     candidates_of,
+    volumes_of,
 )
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
@@ -97,7 +99,7 @@ def reconstruct_file(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(StateEntered("held_out", message, time=clock.now()))
-    volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
+    volume = 4 * volumes_of(options.method) * math.prod(Grid.matching(prepared.geometry).shape)
     volumes = volume * options.target.written * (1 + options.uncertainty)
     options.target.require_room(*(options.disk_needs(volume) if slabs else (volumes, 0)))
     if truth_given is not None:  # before the work
@@ -188,6 +190,8 @@ def check_device(device: str) -> None:
 
 def _refuse_foreign(options: ReconOptions) -> None:
     """Raises ConfigError for options that the method would silently ignore."""
+    if options.method.traits.in_time:
+        _refuse_for_series(options)
     given = {
         "a quality preset": (options.quality is not None, "presets"),
         "a time budget": (options.budget is not None, "budget"),
@@ -199,6 +203,17 @@ def _refuse_foreign(options: ReconOptions) -> None:
             raise ConfigError(
                 f"{options.method.name} does not take {what} (of {owners}): leave that out, or choose another method."
             )
+
+
+def _refuse_for_series(options: ReconOptions) -> None:
+    """Raises ConfigError for what is of one volume alone."""
+    of_one = {"a box of voxels": options.region, "a truth": options.truth, "a cluster": options.cluster}
+    for what, given in of_one.items():
+        if given is not None:
+            raise ConfigError(f"Volumes in time do not go with {what}: leave that out. Nothing was read.")
+    output = options.target.output
+    if options.target.written and output.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +289,7 @@ class _Job:
         with self.refused(f" by {method.name}"):
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
-                use=DataUse(weights, held_out, prepared.emission), control=control,
+                use=DataUse(weights, held_out, prepared.emission, prepared.times), control=control,
             )  # fmt: skip
 
 
@@ -346,8 +361,8 @@ def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
     if method.traits.held_out:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    # The sweeps of a finish follow the last step, and can be stopped as well.
-    finishes = isinstance(method, FitMethod) and method.finish_sweeps > 0
+    # The sweeps of a finish, and the factors of volumes in time, follow the last step, and can be stopped as well.
+    finishes = method.traits.in_time or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return _recorded(result, early, resumed | ({"checkpoint_lost": lost} if lost else {})), chosen

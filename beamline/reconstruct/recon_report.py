@@ -15,14 +15,16 @@ from beamline.report.contact_sheet import contact_sheet, reference_sheet
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, price_of_decibel, price_text, residual_curve, views_grew
+from beamline.report.slice_sheet import SliceSheet
 from beamline.report.time_curves import quality_against_time
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Volume, VolumesInTime
 from recon.methods import BASELINE
 from recon.voxels.unexplained import LIMIT, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
+_SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
 
 
@@ -52,7 +54,9 @@ def compose(
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
-            *_pictures(made, prepared, truth, volumes, unexplained, context.psnr),
+            *(_slices(prepared, truth, volumes) if made.series is None else _times(made.series)),
+            *_doubts(made, prepared, unexplained, context.psnr),
+            *_views(prepared),
             *_stray_mass(context.stray, made.volume.grid, prepared),
             *_frame_pictures(context.facts),
         ],
@@ -74,8 +78,12 @@ def _summary(
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
     best = best if best in own else "seconds"  # a region by FBP is compared with nothing
+    shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
+    if made.series is not None:
+        seconds = made.series.seconds
+        what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
-        f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
+        f"{what} {shape} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s ({context.elapsed:.1f} s of the whole command); "
         f"{METRICS[best].label} {formatted(best, own[best])}"
     )
@@ -98,7 +106,9 @@ def _footnotes(
 ) -> list[str]:
     """What the figures of merit mean, as far as there are any."""
     footnotes = [
-        "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
+        "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
+        if made.series is None
+        else "Data residual: what the volumes, each view at its time, leave of all views. It falls with noise.",
         "Time of the whole command: from its start to this page, with reading, correction and measuring.",
     ]
     if any("cnr" in values for values in metrics.values()):
@@ -169,16 +179,9 @@ def _frame_pictures(facts: ScanFacts) -> list[Picture]:
     return pictures
 
 
-def _pictures(
-    made: Reconstruction,
-    prepared: PreparedProjections,
-    truth: Volume | None,
-    volumes: Mapping[str, Volume],
-    unexplained: Unexplained | None,
-    psnr: Sequence[tuple[float, float]],
-) -> list[Picture]:
-    data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
-    kind, row = prepared.kind, geometry.detector_shape[0] // 2
+def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mapping[str, Volume]) -> list[Picture]:
+    """Slices of all volumes, and in what these differ from the first."""
+    unit, kind = prepared.length_unit, prepared.kind
     shown = {"Truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     pictures = [
@@ -200,8 +203,6 @@ def _pictures(
             figures.profile_and_values(shown, unit, kind),
         ),
     ]
-    if unseen := unseen_wedges(geometry):
-        pictures.append(Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit)))
     if len(shown) > 1:
         pictures.append(
             Picture(
@@ -211,6 +212,36 @@ def _pictures(
                 figures.differences(shown, unit, kind),
             )
         )
+    return pictures
+
+
+def _times(series: VolumesInTime) -> list[Picture]:
+    """Slices of some volumes in time, side by side."""
+    n, depth = series.data.shape[:2]
+    some = np.unique(np.linspace(0, n - 1, min(n, _SHOWN)).round().astype(int))
+    pictures = []
+    for title, turned in (("Slices of each time", False), ("Upright slices of each time", True)):
+        if turned and depth < _UPRIGHT:
+            continue
+        sheet = SliceSheet("z" if turned else "y")
+        for k in some:
+            volume = series.data[k]
+            sheet.add(f"{series.seconds[k]:.4g} s", volume.swapaxes(0, 1) if turned else volume)
+        caption = f"{len(some)} of {n} times in one grey window: what differs has changed or moved."
+        pictures.append(Picture(title, caption, sheet.png(sheet.labels())))
+    return pictures
+
+
+def _doubts(
+    made: Reconstruction,
+    prepared: PreparedProjections,
+    unexplained: Unexplained | None,
+    psnr: Sequence[tuple[float, float]],
+) -> list[Picture]:
+    """What the views do not show, error bars, what the volume leaves in the views, and how the work went."""
+    unit, kind, pictures = prepared.length_unit, prepared.kind, []
+    if unseen := unseen_wedges(prepared.geometry):
+        pictures.append(Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit)))
     if made.deviation is not None:
         pictures.append(
             Picture(
@@ -239,22 +270,27 @@ def _pictures(
                 quality_against_time(history_arrays(made.history), psnr, price_of_decibel(made)),
             )
         )
-    pictures += [
+    return pictures
+
+
+def _views(prepared: PreparedProjections) -> list[Picture]:
+    """A corrected view, a sinogram, the search of the axis, and the poses."""
+    data, geometry, unit, axis = prepared.projections.data, prepared.geometry, prepared.length_unit, prepared.axis
+    pictures = [
         Picture(
             "Projection",
-            f"One corrected view: the line integral of the {kind.value} along each ray. Air is better the nearer "
-            "to 0 and the more even it is.",
+            f"One corrected view: the line integral of the {prepared.kind.value} along each ray. Air is better the "
+            "nearer to 0 and the more even it is.",
             figures.projection(data, geometry, 0, unit),
         ),
         Picture(
             "Sinogram",
             "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
             "that breaks off is a view that does not fit.",
-            figures.sinogram(data, geometry, row),
+            figures.sinogram(data, geometry, geometry.detector_shape[0] // 2),
         ),
     ]
-    if prepared.axis is not None:
-        axis = prepared.axis
+    if axis is not None:
         pictures.append(
             Picture(
                 "Rotation axis",
@@ -265,13 +301,13 @@ def _pictures(
         )
     turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
     if geometry.shifts.any() or turns.any():
-        pitch, unit = geometry.sample_pitch, prepared.length_unit
+        moved = geometry.shifts * geometry.sample_pitch
         pictures.append(
             Picture(
                 "Poses of the views",
                 "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
                 "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
-                figures.pose_curves(np.degrees(geometry.angles), geometry.shifts * pitch, turns, unit),
+                figures.pose_curves(np.degrees(geometry.angles), moved, turns, unit),
             )
         )
     return pictures

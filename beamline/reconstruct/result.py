@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
@@ -16,6 +18,7 @@ from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
 from beamline.report.record import history_arrays, price_of_decibel, price_text
+from beamline.storage import hdf5
 from beamline.storage.recon_record import ReconRecord, VolumeInFile
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
@@ -74,8 +77,7 @@ def write_result(
         raise
     phases.end()
     elapsed = clock.now() - context.started
-    volume = _left_in_file(record, target)
-    record = replace(record, volume=volume, deviation=None, fbp=None, model={}, elapsed=elapsed, times=phases.seconds)
+    record = replace(record, **_left_in_file(record, target), elapsed=elapsed, times=phases.seconds)
     sink(VolumeDone(record, time=clock.now()))
     return dict(record.metrics)
 
@@ -93,7 +95,7 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
         length_unit=prepared.length_unit,
         kind=prepared.kind,
         raw_file=str(context.facts.path.resolve()),
-        title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
+        title=_title(made, context),
         sample=context.facts.sample or "not stated",
         time=now,
         parameters=parameters_of(made, prepared, context),
@@ -102,6 +104,7 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
         deviation=None if made.deviation is None else written(made.deviation).data,
         fbp=volumes[BASELINE].data if judged.keeps_fbp else None,
+        series=made.series,
         compared=judged.metrics.get(BASELINE) if len(judged.metrics) > 1 else None,
         warnings=tuple(judged.warnings),
         hiding=judged.hiding,
@@ -114,11 +117,39 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
     return record, volumes
 
 
-def _left_in_file(record: ReconRecord, target: OutputPaths) -> VolumeInFile:
-    """The volume by its file: a kept record holds neither voxels nor an open file until the voxels are used."""
+def _title(made: Reconstruction, context: ReportContext) -> str:
+    if made.series is not None:
+        return f"{len(made.series.seconds)} volumes in time of {context.facts.name}"
+    return f"{label_of(made.method)} reconstruction of {context.facts.name}"
+
+
+def _left_in_file(record: ReconRecord, target: OutputPaths) -> dict[str, Any]:
+    """Fields of a record that holds no voxels and no open file until they are used: all are in the file alone."""
 
     def read() -> Volume:
-        with opened_volume(target.output) as stored:
+        with opened_volume(target.output, at=None if record.series is None else 0) as stored:
             return replace(stored.volume, data=np.array(stored.volume.data[:]))
 
-    return VolumeInFile(record.grid, read)
+    series = record.series
+    if series is not None and target.written:
+        series = replace(series, data=_VolumesInFile(target.output, series.data.shape))
+    return {"volume": VolumeInFile(record.grid, read), "series": series, "deviation": None, "fbp": None, "model": {}}
+
+
+@dataclass(frozen=True)
+class _VolumesInFile:
+    """Volumes [time, z, y, x] of a file, which is opened where they are used."""
+
+    path: Path
+    shape: tuple[int, ...]
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        return np.dtype(np.float32)
+
+    def __getitem__(self, part: Any) -> NDArray[np.float32]:
+        with hdf5.open_hdf5(self.path) as file, hdf5.readable(self.path):
+            return np.asarray(file["entry/data/data"][part])
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype)

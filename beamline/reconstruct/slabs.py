@@ -15,7 +15,7 @@ from beamline.core.machine import free_memory
 from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
-from beamline.core.text import size
+from beamline.core.text import count, size
 from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens
@@ -34,8 +34,9 @@ from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
+from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.method import DividedMethod, Method, candidates_of
+from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
 from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
@@ -93,7 +94,8 @@ class Needs:
 
     @property
     def volume(self) -> int:
-        return 4 * math.prod(Grid.matching(self.geometry).shape)
+        """Of the result, which may be several volumes."""
+        return 4 * volumes_of(self.method) * math.prod(Grid.matching(self.geometry).shape)
 
     @property
     def at_once(self) -> int:
@@ -132,7 +134,7 @@ class Needs:
         """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
         looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
-        most = max(odd, _REGION * min(self.volume // 4, _REGIONS), *looks)
+        most = max(odd, _REGION * min(math.prod(Grid.matching(self.geometry).shape), _REGIONS), *looks)
         return most if most > _ASIDE else 0
 
     @property
@@ -153,8 +155,8 @@ class Needs:
 
     def height(self, memory: int) -> int:
         """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
-        for count in range(1, self.rows // _ROWS + 2):
-            height = math.ceil(self.rows / count / _ROWS) * _ROWS
+        for parts in range(1, self.rows // _ROWS + 2):
+            height = math.ceil(self.rows / parts / _ROWS) * _ROWS
             if self.slab(height) <= memory:
                 return height
         return _ROWS
@@ -244,7 +246,15 @@ def memory_of(options: ReconOptions) -> int:
 
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
-    """Raises ConfigError for options that need everything in memory."""
+    """Raises ConfigError for a method and for options that need everything in memory."""
+    if options.method.traits.in_time:
+        fewer = int(needs.rows * memory / needs.at_once)
+        rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
+        raise ConfigError(
+            f"{count(volumes_of(options.method), 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
+            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes in time are not made in slabs: "
+            f"give {rows}--bin. Nothing was written."
+        )
     poses = stated_poses(source, options.selection)
     whole = {
         "--calibrate with roll or tilt": options.selection.step(Calibrate).may_lean,
@@ -302,6 +312,8 @@ def prepare_within(
     def check(geometry: Geometry) -> None:
         if options.region is not None:
             locate(options.region, options.selection, geometry)
+        if options.method.traits.in_time and (needs := Needs(options.method, geometry, 0, True)).at_once > memory:
+            refuse_whole(source, options, needs, memory)
         if buffer is not None and not geometry.is_straight:
             raise DataError(
                 f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
@@ -310,6 +322,8 @@ def prepare_within(
 
     prepared = prepare_projections(source, options.selection, warn, buffer, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
+    if method.traits.in_time:
+        prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
     if buffer is None:
         if options.partial is not None:
             raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
@@ -324,6 +338,16 @@ def prepare_within(
     slabs, _ = slabs_of_partial(options.partial)
     refuse_slabs(options.partial, slabs, needs, memory)
     return prepared, slabs
+
+
+def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
+    """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
+    seconds = source.times
+    if seconds is not None and np.isfinite(seconds[view_ids]).all():
+        return np.asarray(seconds[view_ids], np.float64)
+    period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
+    warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
+    return np.asarray(view_ids * float(period), np.float64)
 
 
 def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Needs, memory: int) -> None:

@@ -13,37 +13,10 @@ from numpy.typing import NDArray
 
 from beamline.core.voxel_kind import VoxelKind
 from recon.assess.time_model import NextDecibel
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Volume, VolumesInTime
 
 Value = str | int | float | bool | NDArray[Any]
 _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that tell how it ended
-
-
-@dataclass(frozen=True, eq=False)
-class VolumesInTime:
-    """Volumes of a sample that changes.
-
-    Attributes:
-        seconds: float64 [time], from the first view on.
-        data: float32 [time, z, y, x], or a dataset of a file.
-    """
-
-    seconds: NDArray[np.float64]
-    data: Any
-
-    def each(self) -> list[Any]:
-        """The volumes, which are read where they are sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
-
-
-class _VolumeAt:
-    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
-
-    def __init__(self, data: Any, at: int) -> None:
-        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
-
-    def __getitem__(self, z: slice) -> NDArray[np.float32]:
-        return np.asarray(self._data[self._at, z])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +124,11 @@ class ReconRecord:
         return bool(self.parameters.get("ended_early", False))
 
     @property
+    def seconds_of_volumes(self) -> tuple[float, ...]:
+        """When each of several volumes in time was, from the first view on; empty where there is one volume."""
+        return () if self.series is None else tuple(self.series.seconds.tolist())
+
+    @property
     def figures(self) -> Mapping[str, float]:
         """`metrics`, as scripts call them."""
         return self.metrics
@@ -178,6 +156,7 @@ class ReconRecord:
         parameters = self.parameters
         ends = {name: parameters[name] for name in _ENDS if name in parameters}
         others = {
+            "times_s": self.seconds_of_volumes or None,
             "hiding": self.hiding or None,
             "chosen": self.chosen or None,
             "next_db": self.next_decibel,
@@ -190,7 +169,7 @@ class ReconRecord:
             "method": self.method,
             "axis_col": self.axis_col,
             "n_views": parameters.get("n_views"),
-            "shape": self.grid.shape,
+            "shape": self.grid.shape if self.series is None else self.series.data.shape,
             "units": self.unit,
             "elapsed": self.elapsed,
             "times": self.times,

@@ -76,7 +76,7 @@ class SeriesFit:
         return replace(self, volumes=2, motion="learnt" if MOTION[self.motion][0] is None else self.motion)
 
     def toy_data(self, geometry: Geometry) -> TrialData:
-        lines, views = _copies_of_toy(geometry)
+        lines, views = toy_of(geometry, _TOYS)
         return TrialData(lines, views, None, None, of_view=np.arange(views.n_views, dtype=np.float64))
 
 
@@ -109,7 +109,7 @@ class MaterialsFit:
         return self
 
     def toy_data(self, geometry: Geometry) -> TrialData:
-        lines, views = _copies_of_toy(geometry)
+        lines, views = toy_of(geometry, _TOYS)
         energies = np.arange(views.n_views, dtype=np.float64) % 2
         sections = np.array([[1, 0.5], [0.5, 1]])
         return TrialData(lines, views, None, None, of_view=energies, sections=sections, states=(0, 1))
@@ -123,14 +123,6 @@ def _measured_lines(data: TrialData) -> tuple[F32, F32 | None]:
     """Line integrals [view, row, col] of the views used, 0 where nothing was measured, and their weights."""
     weights = None if data.weights is None else data.weights[: data.geometry.n_views]
     return data.projections if weights is None else np.where(weights > 0, data.projections, np.float32(0)), weights
-
-
-def _copies_of_toy(geometry: Geometry) -> tuple[F32, Geometry]:
-    lines, views = toy_of(geometry)
-    copies = views
-    for _ in range(_TOYS - 1):
-        copies = copies.followed_by(views)
-    return np.tile(lines, (_TOYS, 1, 1)), copies
 
 
 def by_parts(count: int, data: TrialData, fit: PartFit) -> VolumeAt:

@@ -21,7 +21,7 @@ from beamline.projections.scan_statistics import Light
 from beamline.projections.selection import Selection
 from beamline.reconstruct.energy_views import energy_views, read_spectra
 from beamline.reconstruct.outcome import facts_of
-from beamline.reconstruct.time_series import times_of
+from beamline.reconstruct.slabs import times_of
 from beamline.storage.readers.open import SourceOptions
 from beamline.trials.data import TrialData
 from beamline.trials.front import TRADEOFF

@@ -17,12 +17,12 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Volume, VolumesInTime
 
 Plain = str | int | float
 Clock = Callable[[], float]
@@ -64,11 +64,14 @@ class DataUse:
         held_out: numbers of the views that are not fitted; their residual is in the history.
         emission: a `recon.Emission`, which this module must not import: the counts that projections and weights are
             made of. None: these are all there is.
+        times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
+            views.
     """
 
     weights: F32 | None = None
     held_out: Sequence[int] = ()
     emission: Any = None
+    times: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +129,7 @@ class Reconstruction:
         method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
         seconds: wall time of the reconstruction, which the caller of `run` measures.
         deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
+        series: of a method of volumes in time: all of them, of which `volume` is the first.
     """
 
     volume: Volume
@@ -136,6 +140,7 @@ class Reconstruction:
     method: str = ""
     seconds: float = 0.0
     deviation: Volume | None = None
+    series: VolumesInTime | None = None
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
@@ -175,6 +180,7 @@ class Traits:
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
+        in_time: it makes several volumes, at times of the scan, all at once in memory.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
         error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
@@ -188,6 +194,7 @@ class Traits:
     budget: bool = False
     any_grid: bool = False
     needs_matter: bool = False
+    in_time: bool = False
     own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None
@@ -272,6 +279,20 @@ class CheckpointedMethod(Method, Protocol):
     @property
     def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
+
+
+@runtime_checkable
+class MethodInTime(Method, Protocol):
+    """A method with the trait `in_time`."""
+
+    @property
+    def volumes(self) -> int:
+        """How many it makes."""
+
+
+def volumes_of(method: Method) -> int:
+    """How many volumes a method makes."""
+    return method.volumes if isinstance(method, MethodInTime) else 1
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:

@@ -1,4 +1,4 @@
-"""Grid and Volume: a box of voxels in the object's frame, and the attenuation in it."""
+"""Grid, Volume and VolumesInTime: a box of voxels in the object's frame, and the attenuation in it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import operator
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,3 +201,33 @@ class Volume:
         z, y, x = (n // 2 for n in self.grid.shape)
         shown = f"z = {z}, y = {y}, x = {x}; black {low:.4g}, white {high:.4g}"
         return html("Volume", pixels, {"voxels": repr(self)[7:-1], "slices": shown})
+
+
+@dataclass(frozen=True, eq=False)
+class VolumesInTime:
+    """Volumes of a sample that changes.
+
+    Attributes:
+        seconds: float64 [time], from the first view on.
+        data: float32 [time, z, y, x], or a dataset of a file.
+        residual: what they leave of the views, each view at its time, over the views (root mean squares); NaN as read
+            from a file, whose metrics have it.
+    """
+
+    seconds: NDArray[np.float64]
+    data: Any
+    residual: float = math.nan
+
+    def each(self) -> list[Any]:
+        """The volumes, which are read where they are sliced along z."""
+        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
+
+
+class _VolumeAt:
+    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
+
+    def __init__(self, data: Any, at: int) -> None:
+        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
+
+    def __getitem__(self, z: slice) -> NDArray[np.float32]:
+        return np.asarray(self._data[self._at, z])

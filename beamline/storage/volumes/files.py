@@ -23,7 +23,12 @@ from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_rec
 from beamline.storage.volumes.nxtomoproc import NexusVolume, NXtomoproc
 from beamline.storage.volumes.plain import Npy
 from beamline.storage.volumes.registry import formats
-from beamline.storage.writers.recon_file import opened_reconstruction, volumes_in_time
+from beamline.storage.writers.recon_file import (
+    SUFFIXES,
+    opened_reconstruction,
+    volumes_in_time,
+    write_reconstruction,
+)
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
@@ -63,6 +68,11 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
         DataError: `path` exists and `replace` is not set, or the disk refuses; nothing is left.
     """
     kind, pixels = format_of(path), pixels or Pixels()
+    if record.series is not None:
+        if path.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"volumes in time go into an HDF5 file, not into {kind.name}")
+        write_reconstruction(path, record, replace=replace)
+        return 0
     if pixels.window is not None and not kind.greys:
         raise ValueError(f"{kind.name} holds the values themselves (float32); leave bits and window out.")
     slices = Slices(record.volume, pixels)

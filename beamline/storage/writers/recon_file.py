@@ -20,10 +20,10 @@ from beamline.core.shipped import version
 from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
 from beamline.storage.recon_record import ReconRecord as ReconRecord  # plug-ins of formats import it from here
-from beamline.storage.recon_record import Value, VolumesInTime
+from beamline.storage.recon_record import Value
 from beamline.storage.structure import require_harmless
 from beamline.storage.writer_lock import opened_whole
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Volume, VolumesInTime
 
 DEFINITION = "NXtomoproc"
 FBP, DEVIATION = "fbp", "data_errors"

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
+import recon
 from beamline import api
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
@@ -22,6 +23,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flag
 
 VIEWS, SPAN = 36, 3.5  # s from the first view to the last
 SCAN = TwoCylinders(np.radians(np.arange(VIEWS) * 111.246), (2, 40), axis_col=19.5)
+ASKED = "--time", "2", "--no-moves", "--set", "sweeps=30"
 FADED = 0.5  # of the attenuation of all, at the last view
 
 
@@ -40,19 +42,15 @@ def weight_given() -> Iterator[None]:
     """No trials of weights, which take most of the time; tests/recon/test_series.py has them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("recon.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
-        patched.setattr("beamline.reconstruct.time_series.SWEEPS", 30)
         yield
 
 
 @pytest.fixture(scope="module")
 def series(scan: Path) -> Path:
     path = scan.with_name("series.h5")
-    done = beamline("recon", str(scan), "--time", "2", "--no-moves", "--axis", "19.5", "-o", str(path))
+    done = beamline("recon", str(scan), *ASKED, "--axis", "19.5", "-o", str(path))
     assert done.exit_code == 0, done.output
-    assert f"{'volumes':<10}2 of 2 x 40 x 40, 0 to 3.5 s" in done.output
-    with h5py.File(path) as file:
-        factors = "smooth" in file["entry/reconstruction/parameters"]
-    assert ("factors of their mean" in done.output) is factors
+    assert f"{'volumes':<10}2 of 2 x 40 x 40 in 1/mm, 0 to 3.5 s" in done.output
     return path
 
 
@@ -94,26 +92,30 @@ def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path:
     page = series.with_suffix(".html").read_text(encoding="utf-8")
     assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
     assert "Data residual, views used" in page and "data:image/png" in page
-    done = beamline("recon", str(scan), "--time", "2", "--no-moves", "--no-report", "-o", str(tmp_path / "s.h5"))
+    done = beamline("recon", str(scan), *ASKED, "--no-report", "-o", str(tmp_path / "s.h5"))
     assert done.exit_code == 0, done.output
     assert left(tmp_path) == {"s.h5"}
 
 
 def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: Path, tmp_path: Path) -> None:
-    wanted = Selection(axis_col=19.5)
-    found = api.reconstruct_series(scan, 2, moves=False, selection=wanted, say=None)
-    assert found.output is None and found.report is None and not found.moves and found.units == "1/mm"
-    assert found.seconds == pytest.approx((0, SPAN)) and found.axis_col == 19.5
+    method, wanted = recon.TimeSeries(volumes=2, moves=False, sweeps=30), Selection(axis_col=19.5)
+    held = api.reconstruct(scan, method, selection=wanted, say=None)
+    assert held.output is None and held.report is None and not held.parameters["moves"] and held.units == "1/mm"
+    assert held.seconds_of_volumes == pytest.approx((0, SPAN)) and held.axis_col == 19.5
     with h5py.File(series) as file:
-        np.testing.assert_array_equal(found.volumes, file["entry/data/data"][()])
-    kept = api.reconstruct_series(scan, 2, moves=False, selection=wanted, output=tmp_path / "kept.h5", say=None)
+        np.testing.assert_array_equal(held.series.data, file["entry/data/data"][()])
+        assert held.metrics["residual"] == file["entry/reconstruction/metrics/residual"][()] > 0
+    kept = api.reconstruct(scan, method, selection=wanted, output=tmp_path / "kept.h5", say=None)
     assert left(tmp_path) == {"kept.h5", "kept.html"} and kept.report == tmp_path / "kept.html"
-    np.testing.assert_array_equal(kept.volumes, found.volumes)
-    assert kept.residual == found.residual > 0 and not kept.ended_early
-    with pytest.raises(api.ConfigError, match="12 views or more for each"):
-        api.reconstruct_series(scan, 4, selection=wanted, say=None)
-    with pytest.raises(api.ConfigError, match=r"ends in \.h5"):
-        api.reconstruct_series(scan, 2, output=tmp_path / "other.tif", say=None)
+    np.testing.assert_array_equal(kept.series.data, held.series.data)
+    np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
+    assert not kept.ended_early
+    with pytest.raises(api.DataError, match="12 views or more for each"):
+        api.reconstruct(scan, recon.TimeSeries(volumes=4), selection=wanted, say=None)
+    for output, more in (("other.tif", {}), ("other.h5", {"rows": (0, 1), "views": "fixed:12"})):
+        with pytest.raises((api.ConfigError, api.DataError)):
+            api.reconstruct(scan, method, output=tmp_path / output, say=None, **more)
+    assert left(tmp_path) == {"kept.h5", "kept.html"}
 
 
 def test_the_series_is_described_and_valid(series: Path) -> None:
@@ -140,19 +142,19 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("--time", "3", "--follow"), 2, "--follow does not go with it"),
-        (("--time", "3", "-m", "fbp"), 2, "--method does not go with it"),
-        (("--time", "3", "--uncertainty"), 2, "--uncertainty does not go with it"),
-        (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "--roi does not go with it"),
+        (("--time", "3", "--follow"), 2, "--time does not go with --follow"),
+        (("--time", "3", "-m", "fbp"), 2, "--time is of series; it does not go with --method fbp"),
+        (("--time", "3", "--uncertainty"), 2, "error bars are of one volume"),
+        (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "a box is of one volume"),
         (("--time", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--time", "1"), 2, "--time"),
         (("--moves",), 2, "give --time N"),
-        (("--time", "4"), 2, "12 views or more for each"),
+        (("--time", "4"), 5, "12 views or more for each"),
         (("--time", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
         (("--time", "2", "--memory", "300K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
-        (("--time", "4", "--dry-run"), 2, "4 volumes of 36 views: expected 2 volumes or more, and 12 views or more"),
+        (("--time", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 2 volumes or more, and 12 views or more"),
         (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
-        (("--time", "2", "--axis", "try:18:20:1"), 2, "Find the axis first: give --axis try without --time"),
+        (("--time", "2", "--axis", "try:18:20:1"), 2, "find the axis first: give --axis try without --time"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
@@ -169,12 +171,11 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     costs = Costs({"rest": Work.of(CLOCK, 30.0), "moving": Work.of(CLOCK, 70.0)})
-    monkeypatch.setattr("beamline.reconstruct.time_series.series_costs", lambda *_: costs)
+    monkeypatch.setattr("recon.series.series_costs", lambda *_: costs)
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
-    assert "2 of 2 x 40 x 40 voxels, from 36 views" in done.output
-    assert "memory" in done.output
-    assert " s to " in done.output.splitlines()[-1]
+    assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
+    assert "about 70 s; about 30 s where the data end it early" in done.output.splitlines()[-1]
     told = json.loads(beamline("recon", str(scan), "--time", "2", "--dry-run", "--json").stdout)
     assert (told["seconds"], told["least_seconds"]) == (70.0, 30.0) and told["time"] > 1e9  # of the event
     assert not left(tmp_path)

@@ -14,9 +14,9 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.scan.control import state_of
 from beamline.scan.states import State
-from beamline.storage.recon_record import VolumesInTime
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import write_reconstruction
+from recon.base.volume import VolumesInTime
 from tests.beamline.page.chromium import (
     BEAMLINE,
     MARKS,

@@ -21,12 +21,11 @@ from beamline.simulate.labels import LabelledRun, write_labels
 from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
-from beamline.storage.recon_record import VolumesInTime
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
-from recon.base.volume import Grid
+from recon.base.volume import Grid, VolumesInTime
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange

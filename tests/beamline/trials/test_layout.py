@@ -19,7 +19,7 @@ from beamline.trials.layout import finite, text, to_csv, to_html, write_page, wr
 from beamline.trials.plans import plan, plan_in_equal_time
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
-from recon.methods import names
+from recon.methods import names_of_one_volume
 from tests.beamline.html_page import parsed_page
 
 BASE = Trial("method", "fbp", 10)
@@ -41,9 +41,9 @@ def test_the_table_fits_into_120_columns(kind: str) -> None:
     if kind == "equal":
         del metrics["resolution"]  # halves are not made in equal time
     planned = {
-        "quick": plan(names(), 1801, 200_000, "quick"),
-        "full": plan(names(), 1801, 200_000, "full"),
-        "equal": plan_in_equal_time(names(), 1801, 200_000, 3600.0),
+        "quick": plan(names_of_one_volume(), 1801, 200_000, "quick"),
+        "full": plan(names_of_one_volume(), 1801, 200_000, "full"),
+        "equal": plan_in_equal_time(names_of_one_volume(), 1801, 200_000, 3600.0),
     }
     outcomes = tuple(
         Outcome(trial, "done", 12345.6, int(4e10), metrics, cpu_seconds=98765.4, reached="12345 iterations")

@@ -8,7 +8,7 @@ from beamline.trials.plans import Depth, trials_of, work_of
 from recon import methods
 
 
-@pytest.mark.parametrize("name", methods.names())
+@pytest.mark.parametrize("name", methods.names_of_one_volume())
 @pytest.mark.parametrize("depth", ["quick", "full"])
 def test_every_trial_is_settings_that_the_method_has(name: str, depth: Depth) -> None:
     method = methods.by_name(name)

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from beamline.trials.plans import Timed, plan, plan_in_equal_time, trials_left, work
 from beamline.trials.trial import QUALITIES, Outcome, Trial
 from recon.base.method import BoundedMethod
-from recon.methods import by_name, names
+from recon.methods import by_name, names_of_one_volume
 
-METHODS = names()
+METHODS = names_of_one_volume()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},

@@ -21,7 +21,7 @@ from beamline.trials.worker import main, on_grid, run
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.methods import by_name, names, taking
+from recon.methods import by_name, names_of_one_volume, taking
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import data_residual
 from tests.beamline.scans import TwoCylinders
@@ -152,7 +152,7 @@ def test_iterations(data: TrialData, method: str) -> None:
 @pytest.mark.parametrize(
     "method",
     [
-        *(name for name in names() if not by_name(name).traits.direct and name not in taking("rays")),
+        *(name for name in names_of_one_volume() if not by_name(name).traits.direct and name not in taking("rays")),
         pytest.param("intratomo", marks=pytest.mark.slow),  # fields share their steps
     ],
 )
