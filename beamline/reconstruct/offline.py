@@ -74,7 +74,57 @@ def reconstruct_file(
         ScanStopped: interrupted, with slabs to go on from.
     """
     started, worked, phases = clock.now(), time.process_time(), Phases(sink, clock)
+    warn = Warnings(sink, clock)
     phases.enter("opening the scan")
+    _refuse_impossible(options)
+    truth_given = None if options.truth is None else read_truth(options.truth)
+    with options.source.open() as source:
+        require_finished(source, options)
+        facts, options = facts_of(source), options.around_region(source)
+        prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
+    prepared = _for_method(options, prepared, slabs, sink, clock, warn)
+    if truth_given is not None:  # before the work
+        fit_truth(truth_given, Grid.matching(prepared.geometry), options.selection.binning)
+    announce(options, prepared, sink, clock)
+    if few := partly_seen_warning(prepared.geometry):
+        warn(few)
+    region = None if options.region is None else locate(options.region, options.selection, prepared.geometry)
+    with keeping(options.partial_path) if slabs else nullcontext():
+        phases.enter("compiling kernels")
+        job = _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region)
+        job.compile_kernels()
+        phases.enter("reconstruction")
+        deadline = Deadline()
+        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
+            method, deadline = fit_within(options.method, prepared, options.target, (started, worked), clock, warn)
+            job = replace(job, options=replace(options, method=method))
+        # A direct method and a slab have no volume so far: a signal interrupts them.
+        stopping = never_stopped if job.options.method.traits.direct or slabs else stop_scope
+        decided = Decisions(options.seed)
+        with stopping() as stopped, warnings_told(warn):
+            done = _volume(replace(job, stop_latch=StopLatch(stopped)), slabs, decided)
+        if options.uncertainty:
+            phases.enter("error bars")
+            with stop_scope() as stopped, warnings_told(warn):
+                job = replace(job, stop_latch=StopLatch(stopped))
+                done = replace(done, made=_with_error_bars(job, done.made, slabs, decided))
+        selection = replace(options.selection, binning=options.selection.binning * done.factor)
+        truth = None if truth_given is None else fit_truth(truth_given, done.made.volume.grid, selection.binning)
+        context = ReportContext(
+            facts, selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
+            region=region, phases=phases, leaves=deadline.leaves, filter=options.filter, chosen=done.chosen,
+        )  # fmt: skip
+        partial_volume = options.partial_path if slabs and options.becomes_output else None
+        with stopping():  # the volume is there: the first signal no longer discards it
+            metrics = write_result(
+                done.made, done.prepared, truth, options.target, context, sink, clock, partial_volume
+            )  # fmt: skip
+        del done  # Windows removes no file that is mapped
+    return metrics
+
+
+def _refuse_impossible(options: ReconOptions) -> None:
+    """Raises ConfigError and DataError for what shows before the scan is read."""
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
@@ -83,13 +133,21 @@ def reconstruct_file(
         refuse_impossible(options)
     if options.cluster is not None:
         refuse_unusable(options.cluster)  # now, before the correction of the scan
-    truth_given = None if options.truth is None else read_truth(options.truth)
-    warn = Warnings(sink, clock)
-    with options.source.open() as source:
-        require_finished(source, options)
-        facts, options = facts_of(source), options.around_region(source)
-        prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
-    selection = options.selection
+
+
+def _for_method(
+    options: ReconOptions,
+    prepared: PreparedProjections,
+    slabs: Sequence[Slab],
+    sink: Sink,
+    clock: Clock,
+    warn: Warnings,
+) -> PreparedProjections:
+    """The views as the method takes them, with some held out where it ends early, after their disk was looked at.
+
+    Raises:
+        ConfigError, DataError: the views do not suffice, or the disk does not.
+    """
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not slabs:
@@ -102,60 +160,7 @@ def reconstruct_file(
     volume = 4 * volumes_of(options.method) * math.prod(Grid.matching(prepared.geometry).shape)
     volumes = volume * options.target.written * (1 + options.uncertainty)
     options.target.require_room(*(options.disk_needs(volume) if slabs else (volumes, 0)))
-    if truth_given is not None:  # before the work
-        fit_truth(truth_given, Grid.matching(prepared.geometry), selection.binning)
-    announce(options, prepared, sink, clock)
-    if few := partly_seen_warning(prepared.geometry):
-        warn(few)
-    region = None if options.region is None else locate(options.region, selection, prepared.geometry)
-    with keeping(options.partial_path) if slabs else nullcontext():
-        phases.enter("compiling kernels")
-        _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
-        phases.enter("reconstruction")
-        deadline = Deadline()
-        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
-            method, deadline = fit_within(
-                options.method, prepared, options.target, (started, worked), clock, warn
-            )  # fmt: skip
-            options = replace(options, method=method)
-        # A direct method and a slab have no volume so far: a signal interrupts them.
-        stopping = never_stopped if options.method.traits.direct or slabs else stop_scope
-        decided = Decisions(options.seed)
-        with stopping() as stopped, warnings_told(warn):
-            job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
-            if options.budget is not None:
-                made, chosen, prepared, factor = _within_budget(job, options.budget)
-                selection = replace(selection, binning=selection.binning * factor)
-            else:
-                made, chosen = _by_slabs(job, slabs, decided) if slabs else _at_once(job, decided)
-        if options.uncertainty:
-            phases.enter("error bars")
-            with stop_scope() as stopped, warnings_told(warn):
-                made = _with_error_bars(replace(job, stop_latch=StopLatch(stopped)), made, slabs, decided)
-        if slabs and options.method.traits.direct and prepared.view_weights is not None:
-            # For the record: FBP takes all rays alike, and so do its figures.
-            made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
-            prepared = replace(prepared, view_weights=None)
-        truth = None if truth_given is None else fit_truth(truth_given, made.volume.grid, selection.binning)
-        context = ReportContext(
-            facts,
-            selection,
-            options.command,
-            options.seed,
-            warn.messages,
-            started,
-            recipe=options.recipe,
-            region=region,
-            phases=phases,
-            leaves=deadline.leaves,
-            filter=options.filter,
-            chosen=chosen,
-        )
-        partial_volume = options.partial_path if slabs and options.becomes_output else None
-        with stopping():  # the volume is there: the first signal no longer discards it
-            metrics = write_result(made, prepared, truth, options.target, context, sink, clock, partial_volume)
-        del made  # Windows removes no file that is mapped
-    return metrics
+    return prepared
 
 
 def require_finished(source: ScanSource, options: ReconOptions) -> None:
@@ -293,6 +298,31 @@ class _Job:
             )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _Done:
+    """A reconstruction, what was chosen, the views that it used, and how much coarser their pixels are."""
+
+    made: Reconstruction
+    chosen: str
+    prepared: PreparedProjections
+    factor: int = 1
+
+
+def _volume(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> _Done:
+    """Reconstruct by the options: within a budget, in slabs, or at once."""
+    prepared = job.prepared
+    if job.options.budget is not None:
+        return _within_budget(job, job.options.budget)
+    if not slabs:
+        return _Done(*_at_once(job, decided), prepared)
+    made, chosen = _by_slabs(job, slabs, decided)
+    if job.options.method.traits.direct and prepared.view_weights is not None:
+        # For the record: FBP takes all rays alike, and so do its figures.
+        made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
+        prepared = replace(prepared, view_weights=None)
+    return _Done(made, chosen, prepared)
+
+
 def _recorded(result: Reconstruction, early: bool, settings: Mapping[str, Any] | None = None) -> Reconstruction:
     """The result with `settings`, and whether it ended early, for the record; without what only a next run needs."""
     ended = {"ended_early": True} if early else {}
@@ -387,11 +417,11 @@ def _chosen(result: Reconstruction) -> str:
     return "" if because is None else f"{result.method}: {because}"
 
 
-def _within_budget(job: _Job, budget: float) -> tuple[Reconstruction, str, PreparedProjections, int]:
-    """Reconstruct within `budget` s. Then what was chosen, the views used, and the binning of their pixels."""
+def _within_budget(job: _Job, budget: float) -> _Done:
+    """Reconstruct within `budget` s, from pixels that may be joined."""
     methods, largest = candidates_of(job.options.method), None if job.region is None else 1
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
         done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
     made = _recorded(replace(done.result, seconds=done.seconds), job.stop_latch.stopped, done.settings(budget))
-    return made, done.summary(budget), done.prepared, done.choice.binning
+    return _Done(made, done.summary(budget), done.prepared, done.choice.binning)
