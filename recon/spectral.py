@@ -146,7 +146,6 @@ def weights_by_views(
         EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop=stop)
         for chosen in (~held_out, held_out)
     )
-
     going = True
 
     def left(weights: F64, trials: int) -> float:

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +24,7 @@ from beamline.core.process import ChildProcess
 from beamline.core.signals import stop_signals
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
@@ -125,7 +125,25 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     folder = result.path.parent
     if result.recon is None:
         raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
+    shown = _Shown(command, config.recon.seed, config.recon.method, started, snapshots)
+    _compare(result.path, folder / RECON, truth, shown, outside, clock)
 
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the page of the demonstration states beside the scan and its volume."""
+
+    command: str
+    seed: int
+    method: str
+    started: float
+    snapshots: _Snapshots
+
+
+def _compare(
+    scan: Path, volume: Path, truth: Callable[[Grid], Volume], shown: _Shown, sink: Sink, clock: Clock
+) -> None:
+    """Compare the live volume and FBP of the same views with the truth, on a page that replaces the volume's."""
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
     from beamline.reconstruct.model import read_model
@@ -140,9 +158,9 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     from recon.base.method import Reconstruction
     from recon.base.volume import Grid, Volume
 
-    record = read_reconstruction(folder / RECON)
+    record = read_reconstruction(volume)
     warnings: list[str] = []
-    with open_scan(result.path) as source:
+    with open_scan(scan) as source:
         facts = facts_of(source)
         selection = Selection(axis_col=float(str(record.parameters["axis_col"])))
         prepared = replace(prepare_projections(source, selection, warnings.append), axis=axis_of(record.parameters))
@@ -150,20 +168,20 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     ideal = truth(grid)
     made = Reconstruction(
         volume=Volume(record.volume.data, grid),
-        method=config.recon.method,
+        method=shown.method,
         seconds=record.metrics["seconds"],
         history=history_from(record.history),
         settings=record.parameters,
-        gaussians=read_model(folder / RECON).gaussians if record.model else None,
+        gaussians=read_model(volume).gaussians if record.model else None,
     )
-    target = OutputPaths(folder / RECON, report_beside(folder / RECON), replace=True)
+    target = OutputPaths(volume, report_beside(volume), replace=True)
     live = target.live_picture.name if target.live_picture.exists() else ""
-    curve = [(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes]
+    curve = [(seconds, psnr(ideal.data, grown.data)) for seconds, grown in shown.snapshots.volumes]
     context = ReportContext(
-        facts, selection, command, config.recon.seed, warnings, started, scan_flags=snapshots.flags, live_picture=live,
-        psnr=curve,
+        facts, selection, shown.command, shown.seed, warnings, shown.started,
+        scan_flags=shown.snapshots.flags, live_picture=live, psnr=curve,
     )  # fmt: skip
-    write_result(made, prepared, ideal, target, context, outside, clock)
+    write_result(made, prepared, ideal, target, context, sink, clock)
 
 
 def _look_ahead(truth: Callable[[Grid], Volume]) -> None:

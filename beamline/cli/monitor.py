@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,8 @@ from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.monitor.check import Level
-    from beamline.projections.replay import Judged, Kind
+    from beamline.projections.replay import Judged, Kind, ScanVerdict
+    from beamline.projections.returned import ReturnedView
 
 
 @click.command()
@@ -106,22 +107,12 @@ def monitor(
         altered = [summed.altered] if summed.altered else []
         for fault in [*summed.references, *altered, *ended]:
             sink(Warned(fault, time=clock.now()))
-        n, alarmed, again, references = (
-            summed.n_frames,
-            summed.alarmed,
-            summed.retaken,
-            summed.references,
-        )
-        done = {
-            "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
-            "flags": summed.flags, "references": references,
-            "aside": summed.aside, "drift": summed.drift, "returned": [vars(view) for view in returned],
-            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
-        }  # fmt: skip
-        sink(Done(done, time=clock.now()))
+        sink(Done(_facts(file, summed, returned), time=clock.now()))
+    n, alarmed, references = summed.n_frames, summed.alarmed, summed.references
     if not as_json:
         end = f"{file}: {n} frames, flagged: {counted(summed.flags)}"
-        end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""
+        if again := summed.retaken:
+            end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
         back = [f"On the way back: {view.said()}." for view in returned]
         drift = [summed.drift] if summed.drift else []
@@ -131,6 +122,16 @@ def monitor(
     if alarmed or references:
         faults = f", and groups of references with a fault: {len(references)}" if references else ""
         raise AlarmError(f"{file}: {len(alarmed)} of {n} frames have an alarm{faults}; stdout lists them.")
+
+
+def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) -> dict[str, Any]:
+    """What the event `done` says of a scan."""
+    return {
+        "file": file, "n_frames": summed.n_frames, "alarmed_frames": len(summed.alarmed),
+        "retaken": len(summed.retaken), "flags": summed.flags, "references": summed.references,
+        "aside": summed.aside, "drift": summed.drift, "returned": [vars(view) for view in returned],
+        "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in summed.kinds],
+    }  # fmt: skip
 
 
 def table(kinds: Iterable[Kind]) -> list[str]:
