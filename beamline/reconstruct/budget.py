@@ -29,7 +29,6 @@ from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
 _RESERVE = 0.02  # share of the budget for unmeasured work
-_LATE = 0.1  # share of the time used that a volume of all pixels may take, when the time is over
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Share of the time that a trial may take by prediction; in fact it may take a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
@@ -45,7 +44,7 @@ class Budgeted:
         prepared: the reconstructed views, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and what its parts were expected to take.
         because: why this method, in words; empty if there was no other.
-        seconds: of everything, small runs that measure the speed included.
+        seconds: of everything but what is measured once on a machine.
     """
 
     result: Reconstruction
@@ -99,13 +98,8 @@ class _Budget:
     def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
         """The best choice of each method (or of one) within this share of the time left.
 
-        If no time is left: the cheapest without binned pixels, if its time is a small share of the time used.
+        If no time is left: the cheapest, which is the one for the shortest time.
         """
-        if self.seconds_left < _RESERVE * self.seconds:
-            full = plans(_LATE * (self.now() - self.begin), self.speeds, 1, self.methods)
-            if math.isfinite(full[0].gain):
-                return [min(full, key=lambda choice: choice.seconds)]
-        # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
         available = max(share * self.seconds_left, sys.float_info.min)
         return plans(available, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
@@ -129,7 +123,7 @@ def within(
     largest: int | None = None,
     rates: Rates | None = None,
 ) -> Budgeted:
-    """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
+    """Reconstruct within `budget` seconds by the clock of `control`.
 
     For each method the settings that the time suffices for follow from its measured curves. Several methods are tried
     on some rows, and the one that predicts views held out best gets the time that is left. Where trials would take more
@@ -146,9 +140,9 @@ def within(
     Raises:
         ValueError: the views cannot be reconstructed.
     """
-    now, begin = control.now, control.now()
-    geometry = prepared.geometry
+    now, geometry = control.now, prepared.geometry
     speeds = speeds_of(geometry, Grid.matching(geometry), rates or MachineSpeed())
+    begin = now()  # what is measured once on a machine is no part of a budget, as kernels that are compiled once
     unbinned = default_count(geometry, geometry.sample_pitch)  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
@@ -156,23 +150,19 @@ def within(
     if any(method.traits.any_grid for method in modelled.values()) and is_wider(_problem_of(prepared, seed)):
         taking = modelled
     plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
-    spent = budget - plan.seconds_left
     choices = plan.choices()
     choice, because = choices[0], ""
-    late = spent + choice.seconds - budget
-    over = late > 0 and plan.seconds_left < _RESERVE * budget
-    if late > 0 and math.isfinite(late) and (over or not math.isfinite(choice.gain)):
+    late = choice.seconds - plan.seconds_left
+    if 0 < late < math.inf and not math.isfinite(choice.gain):
         warn(
-            f"{duration_text(budget)} are too few for this scan: measuring this machine took {duration_text(spent)}, "
-            f"and the cheapest choice, {_named(choice)}, will be about {duration_text(late)} late."
+            f"{duration_text(budget)} are too few for this scan: the cheapest choice, {_named(choice)}, will be about "
+            f"{duration_text(late)} late."
         )
     if len(choices) > 1:
         choice, because = _chosen(plan, choices, prepared, seed, control)
     prepared = binned(prepared, choice.binning)
     method = plan.method(choice, unbinned)
     end = begin + budget * (1 - _RESERVE)
-    if over and math.isfinite(choice.gain):
-        end = now() + choice.seconds
     result = _run(method, prepared, seed, end, control)
     return Budgeted(result, prepared, choice, speeds, because, now() - begin)
 

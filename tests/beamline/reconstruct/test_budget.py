@@ -119,44 +119,26 @@ def test_a_slow_machine_takes_fbp_of_binned_pixels(
     assert "binned 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
 
 
-def test_what_the_measuring_has_used_up_leaves_the_cheapest_choice_which_is_said_to_be_late(
+def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """What is measured once on a machine is not counted."""
     clock = Ticking(0.01)
 
     def slow(*_: object) -> Speeds:
         clock.time += 7.0
-        return Speeds(432.0, 50.0, 3.0, 10.0, 9.0)
+        return Speeds(4320.0, 50.0, 3.0, 10.0, 9.0)
 
     monkeypatch.setattr(module, "speeds_of", slow)
     warned: list[str] = []
     done = _spend(prepared, 5.0, clock, warned)
     binned_pixels = done.choice.binning
     assert not done.choice.is_gaussian_fit and binned_pixels >= 4  # about as many as six rows allow
-    assert done.seconds > 7 and f"of {5.0:.3g} s" in done.summary(5.0)
-    assert len(warned) == 1 and "measuring this machine took 7.01 s" in warned[0]
-    late = 7.01 + 432 / binned_pixels**3 - 5
-    assert warned[0].endswith(f"fbp, binned {binned_pixels} x {binned_pixels}, will be about {late:.3g} s late.")
-    _spend(prepared, 20.0, clock, warned)
+    assert done.seconds < 5 and "of 5 s" in done.summary(5.0)
+    named = f"fbp, binned {binned_pixels} x {binned_pixels}"
+    assert len(warned) == 1 and f"5 s are too few for this scan: the cheapest choice, {named}, will be" in warned[0]
+    _spend(prepared, 4320.0, clock, warned)
     assert len(warned) == 1
-
-
-@pytest.mark.parametrize("budget", [1e-3, 5.0])
-def test_what_the_measuring_has_used_up_joins_no_pixels_to_save_milliseconds(
-    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
-) -> None:
-    clock = Ticking(1e-4)
-
-    def slow(*_: object) -> Speeds:
-        clock.time += 15.0
-        return Speeds(8e-3, 2.0, 0.1, 0.5, 0.2)
-
-    monkeypatch.setattr(module, "speeds_of", slow)
-    warned: list[str] = []
-    done = _spend(prepared, budget, clock, warned)
-    assert (done.choice.method, done.choice.binning) == ("fbp", 1)
-    assert done.result.volume.grid == Grid.matching(prepared.geometry)
-    assert len(warned) == 1 and "the cheapest choice, fbp, will be about" in warned[0]
 
 
 def test_a_fit_with_much_time_ends_with_its_plan(
@@ -385,10 +367,8 @@ def test_a_real_budget_of_processor_seconds(prepared: PreparedProjections) -> No
     """Four seconds, and a tenth of grace; other work on the machine does not count. That the time is used up, the
     first test shows."""
     warm_up()
-    begin = time.process_time()
     done = within(4.0, prepared, [R2()], 0, RunControl(now=time.process_time), lambda w: None)
-    took = time.process_time() - begin
     assert done.choice.is_gaussian_fit
-    assert 1.5 < took < 4.4
+    assert 1.5 < done.seconds < 4.4
     assert done.seconds == pytest.approx(took, abs=0.2)
     assert done.result.history[-1].residual < 0.2
