@@ -14,12 +14,12 @@ from beamline.config.section import Section
 from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
 from recon.base.choices import AUTO
-from recon.methods import DEFAULT, names, streams
+from recon.methods import DEFAULT, names_of_one_volume, streams
 
 if TYPE_CHECKING:
     MethodName = str
 else:
-    MethodName = Literal[(AUTO, *names())]
+    MethodName = Literal[(AUTO, *names_of_one_volume())]
 
 
 class SampleSection(Section):

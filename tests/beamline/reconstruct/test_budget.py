@@ -370,5 +370,4 @@ def test_a_real_budget_of_processor_seconds(prepared: PreparedProjections) -> No
     done = within(4.0, prepared, [R2()], 0, RunControl(now=time.process_time), lambda w: None)
     assert done.choice.is_gaussian_fit
     assert 1.5 < done.seconds < 4.4
-    assert done.seconds == pytest.approx(took, abs=0.2)
     assert done.result.history[-1].residual < 0.2
