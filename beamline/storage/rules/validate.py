@@ -295,13 +295,16 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
     """How much the sums of rows of [view, row, col] change from view to view, over what those of columns do; squared.
 
     About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
-    are. What a drifting beam does to rows is in their ends, too: a parabola over the rows is taken off.
+    are. What a drifting beam does to rows is in their ends, too, and so is matter that leaves a narrow field, from each
+    row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends, are taken
+    off.
     """
     change = depths - depths.mean(axis=0)
     ends = max(1, depths.shape[2] // 16)
     beside = np.median(np.concatenate([change[..., :ends], change[..., -ends:]], axis=2), axis=2)
-    heights = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
-    change = change - (beside @ np.linalg.pinv(heights).T @ heights.T)[..., None]
+    parabola = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
+    profiles = np.column_stack([parabola, depths.mean(axis=(0, 2))])
+    change = change - (beside @ np.linalg.pinv(profiles, rcond=1e-6).T @ profiles.T)[..., None]
     of_rows, of_cols = (float(change.sum(axis=axis).var(axis=0).sum()) for axis in (2, 1))
     rounding = 1e-20 * float((np.abs(depths).sum(axis=2) ** 2).sum())
     return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0

@@ -438,7 +438,11 @@ def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:
 def test_a_horizontal_axis_is_told_and_a_vertical_one_never(rows: int, cols: int, noise: float, drift: float) -> None:
     rng = np.random.default_rng(rows)
     lines, even = _lopsided(12, rows, cols), np.ones((12, rows, cols))
-    for sample in (lines, 0 * lines, even * lines[:1].mean(axis=0)):  # also none, and one that is round
+    theta, u = np.linspace(0, np.pi, 12, endpoint=False)[:, None], np.linspace(-1, 1, cols)
+    squared = 64 * np.cos(theta) ** 2 + 16 * np.sin(theta) ** 2  # half-axes of 8 and 4 half fields, upper half denser
+    wide = (64 * np.sqrt(squared - u**2) / squared)[:, None] * np.where(np.arange(rows) < rows / 2, 0.2, 0.1)[:, None]
+    round_one = even * lines[:1].mean(axis=0)
+    for sample in (lines, 0 * lines, round_one, wide):  # also none, and one that goes on beyond the field
         beam = drift * rng.standard_normal((12, 1, 1)) + drift * np.linspace(-1, 1, rows)[:, None] * even
         assert change_of_rows(sample + beam + noise * rng.standard_normal(lines.shape)) < 10
     turned = np.rot90(lines, axes=(1, 2))
