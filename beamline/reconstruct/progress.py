@@ -35,7 +35,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
 
 
 def sweeps_told(counting: Callable[[str], Callable[[int, int], None]], sweeps: int) -> Callable[[int], None]:
-    """A listener to the sweeps of `recon.fit_materials` and `recon.fit_series`: of trials, which count down, then of
+    """A listener to the sweeps of `recon.fit_materials`: of trials, which count down, then of
     the fit. What is told as left of trials are those that may follow.
 
     Args:
