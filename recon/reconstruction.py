@@ -13,7 +13,7 @@ from torch import Tensor
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.method import Reconstruction as Reconstruction
-from recon.base.units import look_negative, warn_of_degrees, warn_of_other_quantity
+from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
@@ -71,7 +71,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         if use.emission is None:
             warn_of_other_quantity(data)
-    if not getattr(chosen, "allow_negative", True) and not look_negative(data):
+    if not getattr(chosen, "allow_negative", True):
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     begin = control.now()

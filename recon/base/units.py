@@ -122,10 +122,13 @@ def look_like_light(projections: NDArray[np.floating]) -> bool:
 
 def look_negative(projections: NDArray[np.floating]) -> bool:
     """Whether values [view, row, col] given as line integrals look like those of the other sign: the logarithm of
-    transmission, which is 0 beside the sample and falls where it is."""
+    transmission, which is 0 beside the sample and falls where it is. Differences of views are of both signs."""
     if projections.ndim != 3 or not projections.size:
         return False
-    return look_like_transmission(np.exp(np.clip(_some(projections), -_OPAQUE, 1)))
+    some = _some(projections)
+    if np.nansum(some, dtype=np.float64) >= -np.nansum(np.abs(some), dtype=np.float64) / 2:
+        return False
+    return look_like_transmission(np.exp(np.clip(some, -_OPAQUE, 1)))
 
 
 def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:
@@ -144,11 +147,5 @@ def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 
         warnings.warn(
             "projections are about 1 at the edges of the views and fall where the sample is: they look like "
             "transmission. Line integrals are its logarithm, -np.log(transmission), and rise there",
-            stacklevel=stacklevel,
-        )
-    elif look_negative(projections):
-        warnings.warn(
-            "projections are about 0 at the edges of the views and fall where the sample is: they look like the "
-            "logarithm of transmission. Line integrals are -np.log(transmission), and rise there",
             stacklevel=stacklevel,
         )

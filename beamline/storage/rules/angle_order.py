@@ -14,6 +14,7 @@ from beamline.storage.rules.references import VIEWS, some_of
 
 _FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
+_MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
 _MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
 
 
@@ -96,12 +97,17 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Fin
         return
     usual, beside = float(np.median(unlike[is_far])), np.diagonal(unlike, 1)
     neighbours = np.minimum(np.append(beside, np.inf), np.append(np.inf, beside))
-    elsewhere = np.where(is_far, unlike, np.inf).min(axis=1)
+    far_alone = np.where(is_far, unlike, np.inf)
+    like, elsewhere = far_alone.argmin(axis=1), far_alone.min(axis=1)
     odd = elsewhere < np.minimum(neighbours, usual / UNLIKE)
     if odd.mean() < _MOST:
         return
+    # A sample with a plane of symmetry looks the same from directions that mirror each other: their sums are equal.
+    sums = np.radians(degrees[odd] + degrees[like[odd]])
+    if abs(np.exp(1j * sums).mean()) > _MIRRORED:
+        return
     first = int(np.flatnonzero(odd)[0])
-    pair = int(some[first]), int(some[np.where(is_far[first], unlike[first], np.inf).argmin()])
+    pair = int(some[first]), int(some[like[first]])
     text = _stated(seen.source, pair)
     yield Finding(
         "warning",
