@@ -201,7 +201,7 @@ def test_a_stop_during_the_fit_writes_the_volumes_so_far(
 
     monkeypatch.setattr(energy_fit.EnergyFit, "sweeps", interrupted)
     output = tmp_path / "out.h5"
-    done = beamline("recon", str(scan), "--time", "2", "--no-moves", "--axis", "19.5", "-o", str(output))
+    done = beamline("recon", str(scan), *ASKED, "--axis", "19.5", "-o", str(output))
     assert done.exit_code == 4, done.output
     with opened_volume(output, at=1) as record:
         assert record.parameters["ended_early"]
