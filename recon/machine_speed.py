@@ -41,7 +41,7 @@ from recon.voxels.tv import TotalVariationProx
 
 _TV_STEPS = 3
 _SERIAL = ("draw",)  # operations of one thread
-_RUNS = 3  # the least of which counts, after one that loads what it needs
+_RUNS = 3  # the quickest counts; one more comes first, and loads the code and the data
 
 
 class _Timed(NamedTuple):

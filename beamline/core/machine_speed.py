@@ -33,7 +33,7 @@ class MachineSpeed:
     Attributes:
         path: of the file; None: in the folder of this user's state.
         now: clock of the measurement, the processor time of this process.
-        today: s since 1970, by which figures age.
+        today: s since 1970; figures older than DAYS are measured again.
         key: what the figures are of.
     """
 

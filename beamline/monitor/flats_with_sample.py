@@ -223,7 +223,7 @@ class _Outshining:
     """How much brighter than each group of flats views are, where they are emptiest.
 
     Attributes:
-        tops: of each group, line integral by which they are brighter in the brightest places; about 0 of an open beam.
+        tops: of each group, how much brighter views are in their brightest places, as a line integral; an open beam: 0.
         edges: the same at the edge of the field where it is least.
         unlike: line integrals by which each group differs in places from that with the least top, but for a factor.
         noise: of a place, in the difference of two groups.
@@ -285,7 +285,7 @@ def outshone(flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]
 
 
 def brighter_in_places(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> float | None:
-    """Line integral by which views outshine the flats in places, but not at an edge of the field; None: nowhere."""
+    """How much brighter than the flats views are in places, as a line integral; None: nowhere, or at the edges, too."""
     seen = _outshining(flats, darks, views)
     if seen is None:
         return None

@@ -129,7 +129,7 @@ class Reconstruction:
         method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
         seconds: wall time of the reconstruction, which the caller of `run` measures.
         deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
-        series: of a method of volumes in time: all of them, of which `volume` is the first.
+        series: all volumes in time, the first of which is `volume`; None: the method makes one.
     """
 
     volume: Volume
@@ -281,18 +281,9 @@ class CheckpointedMethod(Method, Protocol):
         """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
 
 
-@runtime_checkable
-class MethodInTime(Method, Protocol):
-    """A method with the trait `in_time`."""
-
-    @property
-    def volumes(self) -> int:
-        """How many it makes."""
-
-
-def volumes_of(method: Method) -> int:
-    """How many volumes a method makes."""
-    return method.volumes if isinstance(method, MethodInTime) else 1
+def volumes_of(method: Any) -> int:
+    """How many volumes a method makes: with the trait `in_time` as many as its setting `volumes` says."""
+    return int(method.volumes) if method.traits.in_time else 1
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:

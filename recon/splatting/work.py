@@ -93,7 +93,7 @@ def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
 
 
 def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
-    """What the parts of a reconstruction take on this machine, by which `plans` chooses."""
+    """Seconds of each part of a reconstruction on this machine; `recon.assess.plans` chooses by them."""
     field = Grid.for_fit(geometry, grid)
     voxels, count = math.prod(field.shape), count_for(field, geometry.is_cone)
     view = Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, count))

@@ -1,6 +1,6 @@
 """Every file that a command writes is read by every command that claims to: all pairs of both.
 
-Series in time are read in test_recon_time.py.
+Series in time are read in test_recon_series.py.
 """
 
 from __future__ import annotations
