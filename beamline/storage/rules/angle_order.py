@@ -82,7 +82,11 @@ def _in_another_order(
 
 
 def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Finding]:
-    """Most views look more like one that is far from them than like their neighbours; rows by ascending angle."""
+    """Most views look more like one that is far from them than like their neighbours; rows by ascending angle.
+
+    Of two measured scans (the tooth, Diamond) as if taken in 2, 3, 4 and 6 passes, 5 of 8 are told, those of
+    two passes never; as they were taken, none.
+    """
     some = some_of(rows, VIEWS)
     some = some[[seen.lit(row) for row in some.tolist()]]
     if some.size < PAIRS:

@@ -95,6 +95,7 @@ def ordered(source: ArraySource) -> list[Finding]:
     return list(angles_in_order(source))  # type: ignore[arg-type]
 
 
+ROD: Balls = [(11, 4, 6, 0.05)]  # off the axis: directions that mirror each other look alike
 EVEN = turn(180, 64)
 PASSES = np.concatenate([np.arange(at, 64, 4) for at in range(4)])
 MIXED = np.random.default_rng(1).permutation(64)
@@ -121,7 +122,7 @@ def test_angles_in_another_order_than_the_frames_are_told(
     assert hit.severity == severity and says in hit.message
 
 
-@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND], ids=["within", "wider", "round"])
+@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND, ROD], ids=["within", "wider", "round", "rod"])
 @pytest.mark.parametrize(
     "true", [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, turn(720, 128), np.r_[EVEN, EVEN]]
 )
