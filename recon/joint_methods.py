@@ -12,11 +12,12 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.base.work import Costs
+from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyViews
+from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS
 from recon.series import SWEEPS, TimedViews, fit_series, series_costs
 from recon.share_fit import STEPS, fit_share
-from recon.spectral import MATERIAL_SWEEPS, fit_materials, material_costs
+from recon.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
 _OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
@@ -167,7 +168,15 @@ class EnergySeries:
         return replace(self, materials=("matter",), states=(), sweeps=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return material_costs(geometry, self.volumes, bool(self.states), self.sweeps)
+        few = min(grid.shape[0], TRIAL_ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
+
+        def swept(sweeps: float, share: float = 1.0) -> Work:
+            views = sweeps * geometry.n_views
+            return Work.of(f"series, energies {self.volumes}", views, views * share * math.prod(grid.shape))
+
+        # A step of the share takes about as long as a sweep.
+        share = swept(SOLUTION_STEPS) + swept(TRIAL_STEPS, few) if self.states else Work()
+        return Costs({self.name: swept(self.sweeps) + share}, swept(TRIAL_SWEEPS, few))
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         volumes = max(_VOLUMES * self.volumes, self.volumes + _OF_SHARE if self.states else 0)

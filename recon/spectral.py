@@ -14,15 +14,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64
-from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS
 from recon.voxels.held_out import ONE_IN, busiest_rows, slab_of
 
-_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
+TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray
 _NEAR = 1.5  # pixels, over which depth is averaged
 _FIRST = 0.1  # the first weight, over the largest gradient at zero
@@ -101,20 +98,6 @@ def fit_materials(
     return Materials(densities, grid, weights, residual)
 
 
-def material_costs(geometry: Geometry, materials: int, states: bool, sweeps: int = MATERIAL_SWEEPS) -> Costs:
-    """The work of `fit_materials`, and of `fit_share` where two of the materials are states of one."""
-    grid = Grid.matching(geometry)
-    voxels = math.prod(grid.shape)
-    few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
-
-    def swept(sweeps: float, share: float = 1.0) -> Work:
-        views = sweeps * geometry.n_views
-        return Work.of(f"series, energies {materials}", views, views * share * voxels)
-
-    share = swept(SOLUTION_STEPS) + swept(TRIAL_STEPS, few) if states else Work()  # a step: about a sweep
-    return Costs({"materials": swept(sweeps) + share}, swept(TRIAL_SWEEPS, few))
-
-
 def weight_of(light: F32) -> F32:
     """Weights of rays that so much of the light passes, up to 1."""
     return np.clip(light / _LITTLE, _LEAST, 1)
@@ -158,7 +141,7 @@ def weights_by_views(
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     rows = slice(None)
     if views.geometry.rows_show_slices:
-        rows = busiest_rows(views.projections, _ROWS)
+        rows = busiest_rows(views.projections, TRIAL_ROWS)
         grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
     fit, judge = (
         EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop=stop)

@@ -18,7 +18,7 @@ from drivers.base.errors import DeviceError
 if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
     from beamline.api.reading import monitor, stream, volumes
-    from beamline.api.reconstruction import ReconResult, reconstruct
+    from beamline.api.reconstruction import ReconResult, energy_scans, reconstruct
     from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
 
@@ -38,6 +38,7 @@ __all__ = [
     "Selection",
     "StopRequest",
     "connect",
+    "energy_scans",
     "monitor",
     "reconstruct",
     "scan",
@@ -49,7 +50,7 @@ __all__ = [
 _LAZY = {
     **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reading"),
-    **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
+    **dict.fromkeys(("ReconResult", "energy_scans", "reconstruct"), "beamline.api.reconstruction"),
     "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }

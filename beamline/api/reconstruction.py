@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,29 +12,49 @@ from typing import Any
 import numpy as np
 
 from beamline.api.instrument import Say, to_stderr
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
+from beamline.reconstruct.energy_scans import EnergyScans, read_spectra
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
+from beamline.scan.energies import scans_of
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recon_record import ReconRecord
 from drivers.base.clock import SystemClock
 from recon.auto import Auto
 from recon.base.choices import AUTO
-from recon.base.method import Method
+from recon.base.method import Method, volume_names_of
 from recon.base.volume import Volume
+from recon.joint_methods import EnergySeries
 from recon.methods import by_name
 
 ReconResult = ReconRecord  # what scripts get
 
 
+def energy_scans(paths: Sequence[str | Path], spectra: str | Path, *, registered: bool = False) -> EnergyScans:
+    """Scans of one sample at several energies, which `reconstruct` takes in place of one scan.
+
+    Args:
+        paths: a scan or a run's folder of each energy; the folder of a series stands for all of its scans.
+        spectra: CSV table of what pure materials attenuate, as of `beamline materials`.
+        registered: find where the sample stood in each scan, and its magnification; correct them.
+
+    Raises:
+        DataError: the table cannot be read, or there is no scan.
+    """
+    scans = scans_of([Path(path) for path in paths], lambda sentence: None)
+    if not scans:
+        raise DataError("There is no scan among these paths; expected one at each energy.")
+    return EnergyScans(tuple(map(SourceOptions, scans)), read_spectra(Path(spectra)), registered)
+
+
 def reconstruct(
-    path: str | Path,
+    path: str | Path | EnergyScans,
     method: str | Method = AUTO,
     *,
     rows: slice | tuple[int, int] | None = None,
@@ -49,9 +69,10 @@ def reconstruct(
     The first Ctrl-C during a fit or iterations ends with the volume so far (`ended_early`), the second discards it.
 
     Args:
-        path: a scan file, or the folder of a run.
+        path: a scan file, or the folder of a run; or scans at several energies, see `energy_scans`.
         method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
-            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`.
+            `recon.TimeSeries(volumes=4)` makes four volumes in time, which are in `series`. Of several energies "auto"
+            is `recon.EnergySeries` of the materials in the table, whose volumes are there, too.
         rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.
@@ -65,7 +86,8 @@ def reconstruct(
         ConfigError: an impossible method or selection. DataError: no scan, data that give no volume, or an output
         that exists or cannot be written. Nothing is written then.
     """
-    place, chosen = scan_file(path), _method(method)
+    source = path if isinstance(path, EnergyScans) else SourceOptions(scan_file(path))
+    chosen = EnergySeries(source.spectra.names) if method == AUTO and path is source else _method(method)
     made: list[ReconRecord] = []
     held: list[Volume] = []
 
@@ -79,14 +101,15 @@ def reconstruct(
         if output is None:
             held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a temporary file
 
-    source = SourceOptions(place)
     wanted = selection_of(source, selection, rows=rows, views=views, binning=binning)
-    with target_of(output, take) as target:
-        command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
+    with target_of(output, take) as given:
+        target = replace(given, names=volume_names_of(chosen))
+        place = str(source.path) if path is not source else list(map(str, (each.path for each in source.scans)))
+        command = f"beamline.api.reconstruct({place!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
         reconstruct_file(options, sink, SystemClock(), StopOnSignal())
     (record,) = made
-    return record if output is not None else replace(record, volume=held[0], output=None)
+    return record if output is not None else replace(record, volume=held[0], output=None, outputs={})
 
 
 def _method(method: str | Method) -> Method:
@@ -99,7 +122,7 @@ def _method(method: str | Method) -> Method:
 
 
 def selection_of(
-    source: SourceOptions,
+    source: SourceOptions | EnergyScans,
     selection: Selection | None,
     *,
     rows: slice | tuple[int, int] | None,
@@ -121,7 +144,7 @@ def target_of(output: str | Path | None, take: Callable[[ReconRecord], None]) ->
         yield OutputPaths(Path(work) / "volume.h5", None, written=False, take=take)
 
 
-def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, int]:
+def _rows(source: SourceOptions | EnergyScans, rows: slice | tuple[int, int]) -> tuple[int, int]:
     if not isinstance(rows, slice):
         return rows
     with source.open() as opened:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,7 @@ from recon.methods import DEFAULT, IN_TIME
 if TYPE_CHECKING:
     from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
+    from beamline.storage.recon_record import ReconRecord
 
 
 _AS_NAMED = (
@@ -88,9 +89,9 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
     if axes is not None:
         _try_axes(options, axes, path, values["as_json"])
     elif values["dry"]:
-        _dry_run(options, SystemClock(), values["as_json"])
+        dry_run(options, SystemClock(), values["as_json"])
     else:
-        _reconstruct(options, values)
+        run_reconstruction(options, values)
 
 
 def _checked_method(context: click.Context, method: str | None, axes: AxisRange | None, slabs: Path | None) -> str:
@@ -156,8 +157,14 @@ def _options(context: click.Context, file: Path, method: str, path: Path, values
     )
 
 
-def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
+def run_reconstruction(
+    options: ReconOptions, values: Mapping[str, Any], more: Callable[[ReconRecord], Sequence[str]] = lambda record: ()
+) -> None:
     """Write the volume and its report, with what happens on the terminal.
+
+    Args:
+        values: of the command's parameters; those that it lacks are not given.
+        more: lines that follow the result.
 
     Raises:
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
@@ -167,31 +174,35 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
     from beamline.reconstruct.offline import reconstruct_file  # here: help needs none of it
 
     last: list[Event] = []
-    stop = StopOnSignal(ready=values["follow"] or options.budget is not None)
+    follow, limit = values.get("follow", False), values.get("max_residual")
+    stop = StopOnSignal(ready=follow or options.budget is not None)
 
     def made(event: Event) -> None:
-        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
+        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices.
+
+        Of several volumes there are some from the first trial on.
+        """
         of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
-        if of_bars or (isinstance(event, FitReached) and not event.unit):
+        if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.several)):
             stop.ready = True
 
     with events_shown(values["as_json"]) as usual:
-        shown = LogLines(sys.stderr, terminal=True) if values["verbose"] and not values["as_json"] else usual
-        with logged(values["log"], shown) as lines:
+        shown = LogLines(sys.stderr, terminal=True) if values.get("verbose") and not values["as_json"] else usual
+        with logged(values.get("log"), shown) as lines:
             sink = fan_out(last.append, made, *lines, shown)
-            scope = EndsWithParent(stop, sys.stdin.fileno()) if values["beside"] else stop
-            reconstruct = follow_scan if values["follow"] else reconstruct_file
+            scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
+            reconstruct = follow_scan if follow else reconstruct_file
             metrics = reconstruct(options, sink, SystemClock(), stop_scope=scope)
-    done, output = last[-1], options.target.output
+    done, output = last[-1], " and ".join(map(str, options.target.outputs))
     assert isinstance(done, VolumeDone)
     if not values["as_json"]:
-        click.echo(results(done.record))
+        click.echo("\n".join([results(done.record), *more(done.record)]))
     if lost := done.record.parameters.get("checkpoint_lost"):
         raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
     if done.record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
-    if values["max_residual"] is not None:
-        require(metrics, values["max_residual"])
+    if limit is not None:
+        require(metrics, limit)
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
@@ -205,7 +216,7 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
         )
 
 
-def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
+def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
     from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.estimate import estimate

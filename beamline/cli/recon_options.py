@@ -25,7 +25,7 @@ from beamline.cli.recipe import config_option
 from beamline.cli.selection_options import selection_options
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.choices import AUTO
-from recon.methods import names
+from recon.methods import names_of_one_scan
 
 if TYPE_CHECKING:
     from beamline.reconstruct.region import Region
@@ -66,6 +66,28 @@ _RUNNING = ("follow", "is for a scan that still runs: give --follow.")
 _IN_MEMORY = dict.fromkeys(("follow", "budget"), "it holds everything in memory")
 _PICTURE = {"axis_trials": "that writes a picture of slices, and nothing else"}
 
+report_option = option(
+    "--report/--no-report",
+    of_one_call=True,
+    default=True,
+    show_default=True,
+    help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
+)
+unfinished_option = option(
+    "--unfinished",
+    of_one_call=True,
+    is_flag=True,
+    help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
+)
+memory_option = option(
+    "--memory",
+    excludes=_IN_MEMORY,
+    metavar="SIZE",
+    callback=parsed(memory_size),
+    help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
+    "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
+)
+
 recon_options = together(
     heading(DATA),
     config_option,
@@ -74,7 +96,7 @@ recon_options = together(
     option(
         "-m",
         "--method",
-        type=click.Choice((AUTO, *names())),
+        type=click.Choice((AUTO, *names_of_one_scan())),
         help="auto chooses fbp, fista-tv, pnp-dct or r2 by views held out. r2 fits Gaussians to the views, "
         "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
         "options of the fit.",
@@ -124,13 +146,7 @@ recon_options = together(
         help=f"Output: {suffixes_text()}; of --axis try a .png. "
         "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
     ),
-    option(
-        "--report/--no-report",
-        of_one_call=True,
-        default=True,
-        show_default=True,
-        help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
-    ),
+    report_option,
     heading(DATA),
     option(
         "--follow",
@@ -162,21 +178,9 @@ recon_options = together(
         metavar="DB",
         help="With --follow: say when ten more views would add at most so many.",
     ),
-    option(
-        "--unfinished",
-        of_one_call=True,
-        is_flag=True,
-        help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
-    ),
+    unfinished_option,
     heading(RESOURCES),
-    option(
-        "--memory",
-        excludes=_IN_MEMORY,
-        metavar="SIZE",
-        callback=parsed(memory_size),
-        help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
-        "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
-    ),
+    memory_option,
     option(
         "--cluster",
         excludes=_IN_MEMORY,

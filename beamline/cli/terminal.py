@@ -246,7 +246,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 
 def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
-    lines = [f"{'output':<10}{record.output}"]
+    lines = [f"{name:<20}{path}" for name, path in record.outputs.items()] or [f"{'output':<10}{record.output}"]
     lines += [f"{'report':<10}{record.report}"] if record.report else []
     shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
     if len(seconds):
@@ -254,7 +254,8 @@ def results(record: ReconRecord) -> str:
             f"{'volumes':<10}{len(seconds)} of {shape} in {record.unit}, {seconds[0]:.4g} to {seconds[-1]:.4g} s"
         )
     else:
-        lines.append(f"{'volume':<10}{shape} in {record.unit}")
+        several = "" if record.series is None else f"{record.series.n} of "
+        lines.append(f"{'volumes' if several else 'volume':<10}{several}{shape} in {record.unit or 'volume fractions'}")
     lines.append(f"{'axis_col':<10}{record.axis_col:.2f}")
     lines += [f"{'chosen':<10}{record.chosen}"] if record.chosen else []
     lines += [f"{'next dB':<10}{record.next_decibel_text}"] if record.next_decibel_text else []

@@ -147,6 +147,7 @@ def tradeoff(
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
+    from beamline.reconstruct.energy_scans import EnergyScans, read_spectra
     from beamline.scan.energies import scans_of
     from beamline.trials.front import TRADEOFF
     from beamline.trials.layout import text
@@ -162,10 +163,13 @@ def tradeoff(
         if spectra is not None:
             files = scans_of(files, Warnings(sink, SystemClock()))
         (source, selection), *others = (chosen(path, seed, values) for path in files)
+        sources = (source, *(each for each, _ in others))
         options = TradeoffOptions(
             scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
             methods=methods or (),
-            several=SeveralVolumes(volumes or 0, others, spectra, names_in(states)),
+            several=SeveralVolumes(
+                volumes or 0, None if spectra is None else EnergyScans(sources, read_spectra(spectra)), names_in(states)
+            ),
             depth="quick" if quick else "full",
             max_seconds=max_seconds,
             seconds=seconds,

@@ -210,7 +210,7 @@ def _charge_map(
     """`--volume`: the state-of-charge map, and its picture."""
     from beamline.core.files import refuse_existing, remove, write_whole
     from beamline.reconstruct.charge_map import charge_map, picture
-    from beamline.reconstruct.energy_views import read_spectra
+    from beamline.reconstruct.energy_scans import read_spectra
     from beamline.storage.volumes.files import write_volume
 
     _refuse_given((*_OF_FILES, *_OF_SCENES, "low", "high"), "curves, and --volume makes a map")

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.recon_record import Value
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
+from recon.base.method import Energies
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -46,6 +48,8 @@ class PreparedProjections:
             None: as `shares` says.
         emission: the counts behind these views; None: the sample does not emit.
         times: [view] s when each was exposed; None: no method asked for it.
+        energies: of the views, where they are of several scans; None: they are of one.
+        recorded: what the volume's file says of several scans, by name; empty of one.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -68,6 +72,8 @@ class PreparedProjections:
     held_out_weights: NDArray[np.float32] | None = None
     emission: Emission | None = None
     times: NDArray[np.float64] | None = None
+    energies: Energies | None = None
+    recorded: Mapping[str, Value] = field(default_factory=dict)
     stretch: float = 1.0
 
     def stretched(self, volume: Volume) -> Volume:

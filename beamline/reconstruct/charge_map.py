@@ -21,8 +21,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.core.voxel_kind import VoxelKind
-from beamline.reconstruct.energy_views import Spectra
-from beamline.reconstruct.slabs import SHARE
+from beamline.reconstruct.energy_scans import Spectra
+from beamline.reconstruct.needs import SHARE
 from beamline.report.figures import downwards, dpi_for, planes, png
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recon_record import ReconRecord

@@ -1,160 +1,109 @@
-"""The views of scans of one sample at several energies as one set, and the table of spectra that they need."""
+"""The views of scans of one sample at several energies as one set, each with its energy."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import text_in
-from beamline.core.machine import free_memory
+from beamline.core.errors import ConfigError
+from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
-from beamline.core.text import size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
-from beamline.reconstruct.slabs import SHARE
-from beamline.storage.readers.open import SourceOptions
+from beamline.projections.view_geometry import stated_geometry
+from beamline.reconstruct.energy_scans import EnergyScans
+from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.method import Energies
 from recon.energy_fit import EnergyViews
+from recon.registration import register_energies
 from recon.voxels.displacement import measured_unmagnified, unmagnified
 
-_COPIES = 8  # of all line integrals: of the scans, joined, as lines and of a subset; with a weight each
 _PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this share: views are interpolated to those of the first
 _ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
 
 
-@dataclass(frozen=True, eq=False)
-class Spectra:
-    """Attenuation of materials.
-
-    Attributes:
-        names: of the materials.
-        energies: keV, [n], rising.
-        attenuation: 1/mm of the pure material, [n, material].
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    energies: NDArray[np.float64]
-    attenuation: NDArray[np.float64]
-
-    def at(self, energy_kev: float) -> NDArray[np.float64]:
-        """[material], between the energies of the table. ConfigError outside of them."""
-        if not self.energies[0] <= energy_kev <= self.energies[-1]:
-            raise ConfigError(
-                f"{self.path} has energies from {self.energies[0]:g} to {self.energies[-1]:g} keV; a scan was made at "
-                f"{energy_kev:g} keV. Nothing was written."
-            )
-        return np.array([np.interp(energy_kev, self.energies, column) for column in self.attenuation.T])
-
-    def states(self, names: Sequence[str]) -> tuple[int, int] | None:
-        """Indices of two materials that are two states of the same one, by their names; None without names.
-
-        Raises:
-            ConfigError: these are not the names of two materials.
-        """
-        if not names:
-            return None
-        if len(set(names)) != 2 or len(names) != 2 or not set(names) <= set(self.names):
-            raise ConfigError(
-                f"--states {','.join(names)}: expected two of the materials {', '.join(self.names)} of {self.path}. "
-                "Nothing was written."
-            )
-        return self.names.index(names[0]), self.names.index(names[1])
+def stated_views(scans: EnergyScans, selection: Selection) -> Geometry:
+    """The views of all scans, as the first one states them, before any frame is read."""
+    with scans.scans[0].open() as first:
+        geometry = stated_geometry(first, selection)
+    views = geometry.n_views
+    for each in scans.scans[1:]:
+        with each.open() as source:
+            views += stated_geometry(source, selection).n_views
+    return repeated(geometry, views)
 
 
-def read_spectra(path: Path) -> Spectra:
-    """A CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
-
-    Raises:
-        DataError: the file cannot be read, or is no such table.
-    """
-    try:
-        lines = [line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip()]
-    except (OSError, csv.Error) as error:
-        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
-    head, *rest = lines or [[]]
-    names = tuple(name.strip() for name in head[1:])
-    if not rest or not names or head[0].strip() != "energy_kev":
-        raise DataError(f"{path} is no table of spectra: it begins {','.join(head)[:80]!r}. Expected {_TABLE}.")
-    values = np.empty((len(rest), len(head)))
-    for number, line in enumerate(rest):
-        try:
-            values[number] = [float(cell) for _, cell in zip(head, line, strict=True)]
-        except ValueError:
-            text = ",".join(line)[:80]
-            raise DataError(f"{path}: {text!r} are not {len(head)} numbers. Expected {_TABLE}.") from None
-    values = values[np.argsort(values[:, 0])]
-    if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
-        raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
-    if any(not name.isprintable() or set(name) & set('/\\:*?"<>|') for name in names) or "" in names:
-        raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
-    if len({name.casefold() for name in names}) < len(names):
-        raise DataError(f"{path}: names of materials must differ, in more than capitals; found {', '.join(names)}.")
-    return Spectra(path, names, values[:, 0], values[:, 1:])
+def repeated(geometry: Geometry, views: int) -> Geometry:
+    """So many views like these."""
+    return geometry.select(np.resize(np.arange(geometry.n_views), views))
 
 
-_TABLE = "a first line 'energy_kev,NAME,NAME,...', then a line of keV and 1/mm for each energy"
-
-
-def energy_views(
-    scans: Sequence[tuple[SourceOptions, Selection]],
-    spectra: Spectra,
+def prepare_energies(
+    scans: EnergyScans,
+    selection: Selection,
     warn: Warn,
-    progress: Callable[[int, int], None],
-    *,
-    registered: bool = False,
-) -> tuple[EnergyViews, PreparedProjections]:
-    """The views of all scans, corrected, in the pixels of the first scan; and the first scan.
+    check: Callable[[Geometry], object] = lambda geometry: None,
+    phases: Phases | None = None,
+) -> PreparedProjections:
+    """As `prepare_projections`, of all scans: the views in the pixels of the first one, with their energies.
 
     The rotation axis of the first scan is used for the others, unless it is told. Views of another pixel size, as a
     lens gives it at another energy, are interpolated.
 
     Args:
-        progress: called with the scans that are read, and all.
-        registered: they will be registered, which cones cannot be.
+        check: as of `prepare_projections`, of the geometry of each scan.
 
     Raises:
-        ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
-            too little memory. DataError: a scan cannot be read.
+        ConfigError: scans that do not fit together, or energies that are missing or do not tell the materials apart.
+            DataError: a scan cannot be read.
     """
     parts: list[PreparedProjections] = []
     middles: list[float] = []
+    phases = phases or Phases()
     attenuation, axis_col = [], None
-    for n, (source, selection) in enumerate(scans, 1):
-        with ExitStack() as opened:
-            scan = opened.enter_context(source.open())
-            if scan.energy_kev is None:
-                raise ConfigError(
-                    f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which "
-                    "chooses the line of the spectra. Nothing was written."
-                )
-            if registered and cone_of(scan, selection) is not None:
-                raise ConfigError(
-                    f"--register: {scan.path} is of a cone, whose rays a shift of the sample turns. Leave it out. "
-                    "Nothing was written."
-                )
-            attenuation.append(spectra.at(scan.energy_kev))
+    for each in scans.scans:
+        with each.open() as scan:
+            attenuation.append(_attenuation(scans, scan, selection))
             chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)
-            held, alike = sum(part.projections.data.size for part in parts), len(scans) - len(parts)
-            check = partial(_refuse_memory, len(spectra.names), held, alike)
-            parts.append(prepare_projections(scan, chosen, warn, check=check))
+            parts.append(prepare_projections(scan, chosen, warn, check=check, phases=phases))
             middles.append(((scan.shape[0] - 1) / 2 - rows_of(scan, chosen).start + 0.5) / chosen.binning - 0.5)
         axis_col = parts[0].axis_col
-        progress(n, len(scans))
     _refuse_unlike(parts)
     seen = [_of_pixels(part, parts[0], row) for part, row in zip(parts, middles, strict=True)]
-    return _joined(seen, attenuation), parts[0]
+    joined = replace(_joined(seen, attenuation), recorded=_recorded(scans))
+    del parts, seen  # copies of all line integrals
+    if not scans.registered:
+        return joined
+    phases.enter("registration", "volumes")
+    return _registered(joined, phases.progress)
+
+
+def _attenuation(scans: EnergyScans, scan: ScanSource, selection: Selection) -> NDArray[np.float64]:
+    """[material] at the energy of a scan. ConfigError where it cannot be one of these scans."""
+    if scan.energy_kev is None:
+        raise ConfigError(
+            f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which chooses "
+            "the line of the spectra. Nothing was written."
+        )
+    if scan.emission is not None:
+        raise ConfigError(f"{scan.path} is of an emission, whose sample absorbs nothing. Nothing was written.")
+    if scans.registered and cone_of(scan, selection) is not None:
+        raise ConfigError(
+            f"--register: {scan.path} is of a cone, whose rays a shift of the sample turns. Leave it out. Nothing was "
+            "written."
+        )
+    return scans.spectra.at(scan.energy_kev)
+
+
+def _recorded(scans: EnergyScans) -> dict[str, str]:
+    return {"scans": ", ".join(str(Path(each.path).resolve()) for each in scans.scans)}
 
 
 def _of_pixels(part: PreparedProjections, first: PreparedProjections, middle: float) -> PreparedProjections:
@@ -178,9 +127,9 @@ def _of_pixels(part: PreparedProjections, first: PreparedProjections, middle: fl
     )
 
 
-def _joined(parts: Sequence[PreparedProjections], attenuation: Sequence[NDArray[np.float64]]) -> EnergyViews:
+def _joined(parts: Sequence[PreparedProjections], attenuation: Sequence[NDArray[np.float64]]) -> PreparedProjections:
     """The views of all scans; those of a scan with another rotation axis than the first are displaced."""
-    weights = [part.ray_weights() for part in parts]
+    first, weights = parts[0], [part.ray_weights() for part in parts]
     data = np.concatenate([part.projections.data for part in parts])
     weight = None
     if any(each is not None for each in weights):
@@ -191,15 +140,61 @@ def _joined(parts: Sequence[PreparedProjections], attenuation: Sequence[NDArray[
             ]
         ).astype(np.float32)
         data = np.where(weight > 0, data, np.float32(0))
-    geometry = parts[0].geometry
+    geometry = first.geometry
     for own in (part.geometry for part in parts[1:]):
         displaced = np.array([own.axis_col - geometry.axis_col, 0.0])
         geometry = geometry.followed_by(replace(own, shifts=own.shifts + displaced))
     energy = np.repeat(np.arange(len(parts)), [part.geometry.n_views for part in parts])
     try:
-        return EnergyViews(data, geometry, energy, np.array(attenuation), weight)
+        views = EnergyViews(data, geometry, energy, np.array(attenuation), weight)
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
+    corrected = [part.projections for part in parts]
+    return _with_views(
+        replace(
+            first,
+            projections=replace(
+                first.projections,
+                view_ids=np.concatenate([each.view_ids for each in corrected]),
+                air=np.concatenate([each.air for each in corrected]),
+                floored=float(np.mean([each.floored for each in corrected])),
+                replaced=float(np.mean([each.replaced for each in corrected])),
+                weights=None,
+            ),
+            n_projections=sum(part.n_projections for part in parts),
+            left_out=sum(part.left_out for part in parts),
+            energies=Energies(energy, views.cross_sections),
+            held_out=None,
+            held_out_ids=None,
+            held_out_weights=None,
+            view_weights=None,
+            measured=None,
+            shares_of=None,
+        ),
+        views,
+    )
+
+
+def _with_views(prepared: PreparedProjections, views: EnergyViews) -> PreparedProjections:
+    projections = replace(prepared.projections, data=views.projections)
+    return replace(prepared, projections=projections, geometry=views.geometry, shares=views.weight)
+
+
+def views_of(prepared: PreparedProjections) -> EnergyViews:
+    """The views of several energies, as `recon.fit_materials` takes them."""
+    assert prepared.energies is not None
+    energies, data = prepared.energies, prepared.projections.data
+    return EnergyViews(data, prepared.geometry, energies.of_view, energies.cross_sections, prepared.shares)
+
+
+def _registered(prepared: PreparedProjections, progress: Callable[[int, int], None]) -> PreparedProjections:
+    """The views corrected by where the sample stood in each scan, which the file records."""
+    try:
+        views, moves = register_energies(views_of(prepared), progress)
+    except ValueError as error:
+        raise ConfigError(f"--register: {error}. Nothing was written.") from error
+    recorded = {**prepared.recorded, "displacements": np.array([astuple(move) for move in moves])}
+    return replace(_with_views(prepared, views), recorded=recorded)
 
 
 def _refuse_unlike(parts: Sequence[PreparedProjections]) -> None:
@@ -221,21 +216,3 @@ def _refuse_unlike(parts: Sequence[PreparedProjections]) -> None:
             )
     if parts[0].length_unit != "mm":
         raise ConfigError("The spectra are in 1/mm; give --pixel-size-um, as the scans do not state it.")
-
-
-def _refuse_memory(materials: int, held: int, alike: int, geometry: Geometry) -> None:
-    """ConfigError where the fit would need too much memory; nothing of this scan is read yet.
-
-    Args:
-        held: rays of the scans before, which are in memory.
-        alike: how many scans, this one and those after it, are taken to have the views of `geometry`.
-    """
-    grid = Grid.matching(geometry)
-    rays = held + alike * geometry.n_views * math.prod(geometry.detector_shape)
-    needs = 4 * (8 * materials * math.prod(grid.shape) + _COPIES * rays)
-    may_use = SHARE * (free_memory() + 4 * held)
-    if needs > may_use:
-        raise ConfigError(
-            f"{materials} materials of {grid.shape} voxels need {size(needs)} of memory; {size(may_use)} "
-            "may be used. Give --rows, --views or --bin. Nothing was written."
-        )

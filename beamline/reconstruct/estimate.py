@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 from beamline.core.errors import DataError
 from beamline.core.text import count, size
 from beamline.projections.view_geometry import stated_geometry
+from beamline.reconstruct.energy_scans import EnergyScans
+from beamline.reconstruct.energy_views import stated_views
 from beamline.reconstruct.error_bars import refuse_impossible
+from beamline.reconstruct.needs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from recon.assess.time_model import duration_text
 from recon.base.method import volumes_of
@@ -24,7 +26,7 @@ class Estimate:
     """The resources of a reconstruction.
 
     Attributes:
-        shape: of the volume [z, y, x], or of volumes in time [time, z, y, x].
+        shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
         memory: bytes that will be used.
@@ -89,11 +91,13 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     with options.source.open() as source:
         options = options.around_region(source)
         geometry = stated_geometry(source, options.selection)
+        if isinstance(options.source, EnergyScans):
+            geometry = stated_views(options.source, options.selection)
         allowed, needs = memory_of(options), needs_of(source, options)
         shape = Grid.matching(geometry).shape
         slabs = missing = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
-        if not fits and geometry.is_cone and not options.method.traits.in_time:
+        if not fits and geometry.is_cone and not options.method.traits.several:
             raise DataError(
                 f"{source.path}: {options.method.name} would take {size(needs.at_once)}, {size(allowed)} of memory may "
                 "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."

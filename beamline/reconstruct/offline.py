@@ -23,6 +23,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
+from beamline.reconstruct.energy_scans import EnergyScans
 from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by, refuse_impossible, refuse_views
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
@@ -48,6 +49,7 @@ from recon.base.method import (
     Reconstruction,
     RunControl,
     candidates_of,
+    volume_names_of,
     volumes_of,
 )
 from recon.base.slabs import Slab
@@ -78,8 +80,8 @@ def reconstruct_file(
     phases.enter("opening the scan")
     _refuse_impossible(options)
     truth_given = None if options.truth is None else read_truth(options.truth)
+    _require_all_finished(options)
     with options.source.open() as source:
-        require_finished(source, options)
         facts, options = facts_of(source), options.around_region(source)
         prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
     prepared = _for_method(options, prepared, slabs, sink, clock, warn)
@@ -163,6 +165,13 @@ def _for_method(
     return prepared
 
 
+def _require_all_finished(options: ReconOptions) -> None:
+    """As `require_finished`, of each scan."""
+    for each in options.source.scans if isinstance(options.source, EnergyScans) else (options.source,):
+        with each.open() as source:
+            require_finished(source, options)
+
+
 def require_finished(source: ScanSource, options: ReconOptions) -> None:
     """Raises DataError for an unfinished scan, unless it is to be taken as it is."""
     if source.finished or options.unfinished:
@@ -195,8 +204,9 @@ def check_device(device: str) -> None:
 
 def _refuse_foreign(options: ReconOptions) -> None:
     """Raises ConfigError for options that the method would silently ignore."""
-    if options.method.traits.in_time:
-        _refuse_for_series(options)
+    _refuse_for_source(options)
+    if options.method.traits.several:
+        _refuse_for_several(options)
     given = {
         "a quality preset": (options.quality is not None, "presets"),
         "a time budget": (options.budget is not None, "budget"),
@@ -210,15 +220,29 @@ def _refuse_foreign(options: ReconOptions) -> None:
             )
 
 
-def _refuse_for_series(options: ReconOptions) -> None:
+def _refuse_for_source(options: ReconOptions) -> None:
+    """Raises ConfigError for a method of other scans than the source has, or of other materials than its spectra."""
+    method, scans = options.method, options.source if isinstance(options.source, EnergyScans) else None
+    if method.traits.by_energy != (scans is not None):
+        wanted = "scans at several energies, and spectra of the materials" if scans is None else "one scan"
+        raise ConfigError(f"{method.name} takes {wanted}. Choose another method. Nothing was read.")
+    if scans is not None and volume_names_of(method) != scans.spectra.names:
+        raise ConfigError(
+            f"{method.name} is of {', '.join(volume_names_of(method))}, {scans.spectra.path} of "
+            f"{', '.join(scans.spectra.names)}: give it the same materials. Nothing was read."
+        )
+
+
+def _refuse_for_several(options: ReconOptions) -> None:
     """Raises ConfigError for what is of one volume alone."""
+    several = "Volumes in time" if options.method.traits.in_time else "Volumes of materials"
     of_one = {"a box of voxels": options.region, "a truth": options.truth, "a cluster": options.cluster}
     for what, given in of_one.items():
         if given is not None:
-            raise ConfigError(f"Volumes in time do not go with {what}: leave that out. Nothing was read.")
+            raise ConfigError(f"{several} do not go with {what}: leave that out. Nothing was read.")
     output = options.target.output
     if options.target.written and output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
+        raise ConfigError(f"-o {output}: {several.lower()} go into HDF5 files; give a name that ends in .h5.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +318,7 @@ class _Job:
         with self.refused(f" by {method.name}"):
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
-                use=DataUse(weights, held_out, prepared.emission, prepared.times), control=control,
+                use=DataUse(weights, held_out, prepared.emission, prepared.times, prepared.energies), control=control,
             )  # fmt: skip
 
 
@@ -391,8 +415,8 @@ def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
     if method.traits.held_out:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    # The sweeps of a finish, and the factors of volumes in time, follow the last step, and can be stopped as well.
-    finishes = method.traits.in_time or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
+    # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
+    finishes = method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return _recorded(result, early, resumed | ({"checkpoint_lost": lost} if lost else {})), chosen

@@ -8,6 +8,7 @@ from pathlib import Path
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.energy_scans import EnergyScans
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.region import Region, selection_around
 from beamline.storage.readers.base import ScanSource
@@ -44,7 +45,7 @@ class ReconOptions:
         recipe: its options that hold for any scan, as YAML, for the record.
     """
 
-    source: SourceOptions
+    source: SourceOptions | EnergyScans
     target: OutputPaths
     selection: Selection
     method: Method = field(default_factory=R2)

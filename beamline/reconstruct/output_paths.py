@@ -28,13 +28,21 @@ def report_beside(output: Path) -> Path:
 @dataclass(frozen=True)
 class OutputPaths:
     """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. `take` gets
-    the result before the file `output` is written. Where that is not to be `written`, its folder is only worked in."""
+    the result before the file `output` is written. Where that is not to be `written`, its folder is only worked in.
+    `names`: of volumes that get a file each, OUTPUT's stem + _NAME; empty: there is one file, `output` itself."""
 
     output: Path
     report: Path | None
     replace: bool = False
     take: Callable[[ReconRecord], None] = lambda record: None
     written: bool = True
+    names: tuple[str, ...] = ()
+
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The files of volumes, in their order."""
+        stem, suffix = self.output.stem, self.output.suffix
+        return tuple(self.output.with_name(f"{stem}_{name}{suffix}") for name in self.names) or (self.output,)
 
     @property
     def partial(self) -> Path:
@@ -57,7 +65,7 @@ class OutputPaths:
     def refuse_existing(self) -> None:
         """Raise DataError before any work if a result exists, or its folder cannot be written to."""
         if not self.replace:
-            for path in (self.output, self.report):
+            for path in (*self.outputs, self.report):
                 if path is not None:
                     refuse_existing(path)
         try:

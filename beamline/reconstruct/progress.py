@@ -34,28 +34,6 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
     return on_progress
 
 
-def sweeps_told(counting: Callable[[str], Callable[[int, int], None]], sweeps: int) -> Callable[[int], None]:
-    """A listener to the sweeps of `recon.fit_materials`: of trials, which count down, then of
-    the fit. What is told as left of trials are those that may follow.
-
-    Args:
-        counting: makes the listener of a stage, whose clock starts then.
-    """
-    tried, trials, fit = 0, counting("trial sweeps"), counting("sweeps")
-
-    def heard(sweep: int) -> None:
-        nonlocal tried, trials, fit
-        if sweep > 0:
-            fit(sweep, sweeps)
-            return
-        tried += 1
-        trials(tried, tried - sweep)
-        if sweep == 0:
-            tried, trials, fit = 0, counting("trial sweeps"), counting("sweeps")
-
-    return heard
-
-
 def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
     """A listener that passes the number of kernels compiled so far on as events."""
     begin = clock.now()

@@ -54,7 +54,7 @@ def compose(
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
-            *(_slices(prepared, truth, volumes) if made.series is None else _times(made.series)),
+            *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
             *_doubts(made, prepared, unexplained, context.psnr),
             *_views(prepared),
             *_stray_mass(context.stray, made.volume.grid, prepared),
@@ -80,8 +80,10 @@ def _summary(
     best = best if best in own else "seconds"  # a region by FBP is compared with nothing
     shape, what = " × ".join(str(n) for n in made.volume.grid.shape), f"{name} volume of"
     if made.series is not None:
-        seconds = made.series.seconds
-        what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
+        seconds, names = made.series.seconds, made.series.names
+        what = f"{len(names)} materials, {', '.join(names)}, of"
+        if not names:
+            what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
         f"{what} {shape} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s ({context.elapsed:.1f} s of the whole command); "
@@ -108,7 +110,7 @@ def _footnotes(
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
         if made.series is None
-        else "Data residual: what the volumes, each view at its time, leave of all views. It falls with noise.",
+        else "Data residual: what the volumes, in each view as it shows them, leave of all views. It falls with noise.",
         "Time of the whole command: from its start to this page, with reading, correction and measuring.",
     ]
     if any("cnr" in values for values in metrics.values()):
@@ -215,19 +217,24 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
     return pictures
 
 
-def _times(series: VolumeSeries) -> list[Picture]:
-    """Slices of some volumes in time, side by side."""
+def _several(series: VolumeSeries) -> list[Picture]:
+    """Slices of some of several volumes, side by side."""
+    of, what = (
+        ("material", "materials in one grey window: 1 where a voxel is full of it.")
+        if series.names
+        else ("time", "times in one grey window: what differs has changed or moved.")
+    )
     n, depth = series.data.shape[:2]
     some = np.unique(np.linspace(0, n - 1, min(n, _SHOWN)).round().astype(int))
     pictures = []
-    for title, turned in (("Slices of each time", False), ("Upright slices of each time", True)):
+    for title, turned in ((f"Slices of each {of}", False), (f"Upright slices of each {of}", True)):
         if turned and depth < _UPRIGHT:
             continue
         sheet = SliceSheet("z" if turned else "y")
         for k in some:
             volume = series.data[k]
-            sheet.add(f"{series.seconds[k]:.4g} s", volume.swapaxes(0, 1) if turned else volume)
-        caption = f"{len(some)} of {n} times in one grey window: what differs has changed or moved."
+            sheet.add(series.labels[k], volume.swapaxes(0, 1) if turned else volume)
+        caption = f"{len(some)} of {n} {what}"
         pictures.append(Picture(title, caption, sheet.png(sheet.labels())))
     return pictures
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.model import arrays_of_model
@@ -70,7 +73,7 @@ def write_result(
         if partial_volume is not None:
             complete(partial_volume, record, target.output, replace=target.replace)
         elif target.written:
-            write_volume(target.output, record, replace=target.replace)
+            _write(record, target)
     except BaseException:
         if page is not None:
             remove(page)
@@ -93,7 +96,7 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
-        kind=prepared.kind,
+        kind=VoxelKind.SHARE if made.series is not None and made.series.names else prepared.kind,
         raw_file=str(context.facts.path.resolve()),
         title=_title(made, context),
         sample=context.facts.sample or "not stated",
@@ -111,7 +114,8 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
         chosen=context.chosen,
         next_decibel=price_of_decibel(made),
         next_decibel_text=price_text(made),
-        output=target.output,
+        output=target.outputs[0],
+        outputs=dict(zip(target.names, target.outputs, strict=True)) if target.names else {},
         report=target.report,
     )
     return record, volumes
@@ -119,28 +123,53 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
 
 def _title(made: Reconstruction, context: ReportContext) -> str:
     if made.series is not None:
-        return f"{len(made.series.seconds)} volumes in time of {context.facts.name}"
+        what = ", ".join(made.series.names) or f"{made.series.n} volumes in time"
+        return f"{what} of {context.facts.name}"
     return f"{label_of(made.method)} reconstruction of {context.facts.name}"
+
+
+def _write(record: ReconRecord, target: OutputPaths) -> None:
+    """All files, or none of them."""
+    with ExitStack() as undo:
+        for path, each in zip(target.outputs, _in_files(record, target.names), strict=True):
+            write_volume(path, each, replace=target.replace)
+            undo.callback(remove, path)
+        undo.pop_all()
+
+
+def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord]:
+    """The record of each file: of one volume where each has a name."""
+    if not names or record.series is None:
+        yield record
+        return
+    for name, data in zip(names, record.series.each(), strict=True):
+        yield replace(
+            record,
+            volume=replace(record.volume, data=data[:]),
+            series=None,
+            title=f"volume fraction of {name}",
+            parameters={**record.parameters, "material": name},
+        )
 
 
 def _left_in_file(record: ReconRecord, target: OutputPaths) -> dict[str, Any]:
     """Fields of a record that holds no voxels and no open file until they are used: all are in the file alone."""
 
     def read() -> Volume:
-        with opened_volume(target.output, at=None if record.series is None else 0) as stored:
+        with opened_volume(target.outputs[0], at=None if target.names or record.series is None else 0) as stored:
             return replace(stored.volume, data=np.array(stored.volume.data[:]))
 
     series = record.series
     if series is not None and target.written:
-        series = replace(series, data=_VolumesInFile(target.output, series.data.shape))
+        series = replace(series, data=_VolumesInFiles(target.outputs, series.data.shape))
     return {"volume": VolumeInFile(record.grid, read), "series": series, "deviation": None, "fbp": None, "model": {}}
 
 
 @dataclass(frozen=True)
-class _VolumesInFile:
-    """Volumes [time, z, y, x] of a file, which is opened where they are used."""
+class _VolumesInFiles:
+    """Volumes [volume, z, y, x] of one file, or of a file each, which are opened where they are used."""
 
-    path: Path
+    paths: tuple[Path, ...]
     shape: tuple[int, ...]
 
     @property
@@ -148,7 +177,17 @@ class _VolumesInFile:
         return np.dtype(np.float32)
 
     def __getitem__(self, part: Any) -> NDArray[np.float32]:
-        with hdf5.open_hdf5(self.path) as file, hdf5.readable(self.path):
+        if len(self.paths) == 1:
+            return self._read(self.paths[0], part)
+        which, *within = part if isinstance(part, tuple) else (part,)
+        numbers = np.arange(self.shape[0])[which]
+        if numbers.ndim == 0:
+            return self._read(self.paths[numbers], tuple(within))
+        return np.stack([self._read(self.paths[n], tuple(within)) for n in numbers])
+
+    @staticmethod
+    def _read(path: Path, part: Any) -> NDArray[np.float32]:
+        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return np.asarray(file["entry/data/data"][part])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:

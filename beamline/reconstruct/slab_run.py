@@ -19,8 +19,8 @@ from beamline.core.shipped import version
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
+from beamline.reconstruct.needs import for_part
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.slabs import for_part
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions

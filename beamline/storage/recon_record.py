@@ -16,6 +16,7 @@ from recon.assess.time_model import NextDecibel
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Value = str | int | float | bool | NDArray[Any]
+_MOVE = ("x", "y", "z", "turn", "image", "magnification")  # of a sample between two scans
 _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that tell how it ended
 
 
@@ -59,7 +60,7 @@ class ReconRecord:
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
-        series: all volumes in time, where `volume` is one of several; None: it is the only one.
+        series: all volumes, where `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
         compared: metrics of FBP of the same views; None without. This and what follows are of a volume that was made
@@ -69,6 +70,7 @@ class ReconRecord:
         chosen: how `auto`, a budget or a preset came to its settings; empty where they were given.
         next_decibel, next_decibel_text: what one more decibel costs; None, and empty, where that is not known.
         output, report: files of the volume and of its report; None: not written.
+        outputs: the file of each of several materials, by name; empty of others.
         elapsed, times: s in all, and of each phase.
     """
 
@@ -93,6 +95,7 @@ class ReconRecord:
     next_decibel: NextDecibel | None = None
     next_decibel_text: str = ""
     output: Path | None = None
+    outputs: Mapping[str, Path] = field(default_factory=dict)
     report: Path | None = None
     elapsed: float = math.nan
     times: Mapping[str, float] = field(default_factory=dict)
@@ -129,6 +132,12 @@ class ReconRecord:
         return () if self.series is None else tuple(self.series.seconds.tolist())
 
     @property
+    def displacements(self) -> list[dict[str, float]]:
+        """Where the sample stood in each of several scans: the fields of `recon.voxels.displacement.Displacement`."""
+        rows: Any = self.parameters.get("displacements", ())
+        return [dict(zip(_MOVE, map(float, row), strict=True)) for row in rows]
+
+    @property
     def figures(self) -> Mapping[str, float]:
         """`metrics`, as scripts call them."""
         return self.metrics
@@ -156,6 +165,8 @@ class ReconRecord:
         parameters = self.parameters
         ends = {name: parameters[name] for name in _ENDS if name in parameters}
         others = {
+            "outputs": self.outputs or None,
+            "displacements": self.displacements or None,
             "times_s": self.seconds_of_volumes or None,
             "hiding": self.hiding or None,
             "chosen": self.chosen or None,

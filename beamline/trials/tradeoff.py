@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -18,11 +17,10 @@ from beamline.core.sinks import Warn
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import Light
-from beamline.projections.selection import Selection
-from beamline.reconstruct.energy_views import energy_views, read_spectra
+from beamline.reconstruct.energy_scans import EnergyScans
+from beamline.reconstruct.energy_views import prepare_energies, views_of
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.slabs import times_of
-from beamline.storage.readers.open import SourceOptions
 from beamline.trials.data import TrialData
 from beamline.trials.front import TRADEOFF
 from beamline.trials.plans import Depth, plan, plan_in_equal_time, plan_in_time, plan_of_energies, telling_first
@@ -32,6 +30,7 @@ from beamline.trials.trial import Outcome, Trial
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
 from recon.base.volume import Grid
+from recon.joint_methods import EnergySeries
 from recon.methods import names_compared
 from recon.series import refuse_few
 from recon.splatting.initialise import default_count
@@ -47,14 +46,12 @@ class SeveralVolumes:
 
     Attributes:
         volumes: in time, to compare a fit of all of them; 0: none.
-        others: scans of the same sample at other energies.
-        spectra: table of what pure materials attenuate.
+        scans: at several energies, with what pure materials attenuate, the first of which is the scan; None: no others.
         states: names of two materials that are two states of the same one; empty: no such pair.
     """
 
     volumes: int = 0
-    others: Sequence[tuple[SourceOptions, Selection]] = ()
-    spectra: Path | None = None
+    scans: EnergyScans | None = None
     states: Sequence[str] = ()
 
 
@@ -97,8 +94,8 @@ def planned_tradeoff(options: TradeoffOptions, warn: Warn) -> tuple[TrialData, P
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    if options.several.spectra is not None:
-        data, trials, table = _of_energies(options, options.several.spectra, warn)
+    if options.several.scans is not None:
+        data, trials, table = _of_energies(options, options.several.scans, warn)
     elif options.several.volumes:
         data, trials, table = _in_time(options, options.several.volumes, warn)
     else:
@@ -162,12 +159,16 @@ def _in_time(options: TradeoffOptions, volumes: int, warn: Warn) -> Comparison:
     return data, trials, _table(options, facts, held.length_unit, opened.light)
 
 
-def _of_energies(options: TradeoffOptions, spectra_file: Path, warn: Warn) -> Comparison:
+def _of_energies(options: TradeoffOptions, scans: EnergyScans, warn: Warn) -> Comparison:
     scan, several = options.scan, options.several
     refuse_existing(scan.folder)
-    spectra = read_spectra(spectra_file)
-    states = spectra.states(several.states) or ()
-    views, first = energy_views([(scan.source, scan.selection), *several.others], spectra, warn, lambda n, of: None)
+    names = scans.spectra.names
+    try:
+        states = tuple(map(names.index, EnergySeries(names, tuple(several.states)).states))
+    except ValueError as error:
+        raise ConfigError(f"--states: {error} of {scans.spectra.path}. Nothing was written.") from error
+    prepared = prepare_energies(scans, scan.selection, warn)
+    views = views_of(prepared)
     energies, held_out = len(views.cross_sections), views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2
     used, unseen = np.flatnonzero(~held_out), np.flatnonzero(held_out)
     order, geometry = np.concatenate((used, unseen)), views.geometry.select(used)
@@ -181,6 +182,6 @@ def _of_energies(options: TradeoffOptions, spectra_file: Path, warn: Warn) -> Co
     trials = plan_of_energies(options.methods or _WITH_JOINT, used.size, start, energies, bool(states))
     with scan.source.open() as source:
         facts = dict(facts_of(source).table)
-    facts |= {"energies": str(energies), "materials": ", ".join(spectra.names), "views used": str(used.size)}
+    facts |= {"energies": str(energies), "materials": ", ".join(names), "views used": str(used.size)}
     facts["volume"] = " × ".join(map(str, grid.shape))
-    return data, trials, _table(options, facts, first.length_unit, None)
+    return data, trials, _table(options, facts, prepared.length_unit, None)

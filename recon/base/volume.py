@@ -221,13 +221,18 @@ class VolumeSeries:
     names: tuple[str, ...] = ()
 
     @property
+    def n(self) -> int:
+        """How many they are."""
+        return len(self.names) or len(self.seconds)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """A short text on each, for people."""
         return self.names or tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
         """The volumes, which are read where they are sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(len(self.labels))]
+        return [_VolumeAt(self.data, at) for at in range(self.n)]
 
 
 class _VolumeAt:

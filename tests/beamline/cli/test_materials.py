@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,17 +13,24 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+import recon
+from beamline import api
 from beamline.cli.main import main
-from beamline.cli.terminal import counting
 from beamline.core.errors import DataError
+from beamline.core.events import Sink
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.energy_views import read_spectra
+from beamline.reconstruct.energy_scans import read_spectra
+from beamline.reconstruct.progress import progress_events
 from beamline.storage.volumes.files import opened_volume
+from drivers.base.clock import Clock
+from recon import spectral
+from recon.base.method import Progress
 from recon.base.ray_width import RayWidth
 from simulators.light.palette import known
 
 pytest.importorskip("xraylib")
+TRIED = spectral.weights_by_views
 ENERGIES = (8.320, 8.345, 8.3485, 8.352)
 PITCH = 2.2e-3  # mm
 GRAINS = {"charged": (-0.03, 0.0), "fresh": (0.025, 0.01)}
@@ -70,6 +78,15 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def weights_given() -> Iterator[None]:
+    """Those that trials find, which take most of the time; tests/recon/test_spectral.py has them."""
+    with pytest.MonkeyPatch.context() as patched:
+        given = lambda views, *_: np.full(views.cross_sections.shape[1], 4e-4)  # noqa: E731
+        patched.setattr(spectral, "weights_by_views", given)
+        yield
+
+
 @pytest.fixture(scope="module")
 def made(scans: list[Path]) -> Path:
     """The folder of the volumes of all scans: out_charged.h5 and out_fresh.h5."""
@@ -97,8 +114,31 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], made: Pa
     for name, other in (("charged", "fresh"), ("fresh", "charged")):
         assert share[name][name] == pytest.approx(1, abs=0.15)
         assert share[other][name] < 0.15
+    page = (made / "out.html").read_text(encoding="utf-8")
+    assert "Slices of each material" in page and "2 materials, fresh, charged, of 6 × 64 × 64 voxels" in page
     again = run("materials", *scans, "--spectra", spectra(made), "-o", made / "out.h5")
     assert "never overwritten" in again.output
+
+
+def test_a_script_gets_the_volumes_that_the_command_writes(scans: list[Path], made: Path, tmp_path: Path) -> None:
+    source, wanted = api.energy_scans(scans, spectra(tmp_path)), api.Selection(axis_col=31.5)
+    held = api.reconstruct(source, selection=wanted, say=None)
+    kept = api.reconstruct(source, selection=wanted, output=tmp_path / "kept.h5", say=None)
+    assert kept.series is not None and held.series is not None and held.series.names == ("fresh", "charged")
+    assert (held.output, held.outputs) == (None, {}) and list(kept.outputs) == ["fresh", "charged"]
+    np.testing.assert_array_equal(kept.series.data, held.series.data)
+    np.testing.assert_array_equal(kept.series.data[1], held.series.data[1])
+    for n, name in enumerate(held.series.names):
+        with opened_volume(made / f"out_{name}.h5") as record:
+            np.testing.assert_array_equal(held.series.data[n], record.volume.data[:])
+            assert record.metrics == pytest.approx(held.metrics | {"seconds": record.metrics["seconds"]})
+    for given, method, said in (
+        (scans[0], recon.EnergySeries(), "takes scans at several energies"),
+        (source, "fbp", "takes one scan"),
+        (source, recon.EnergySeries(("a", "b")), "materials is of a, b"),
+    ):
+        with pytest.raises(api.ConfigError, match=said):
+            api.reconstruct(given, method, say=None)
 
 
 def test_states_of_one_material_keep_their_sum(scans: list[Path], made: Path, tmp_path: Path) -> None:
@@ -212,11 +252,12 @@ def test_an_output_of_another_format_is_refused(scans: list[Path], tmp_path: Pat
 def test_too_little_memory_is_said_before_a_scan_is_corrected(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beamline.reconstruct.energy_views.free_memory", lambda: 1e6)
-    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
-    assert done.exit_code == 2
-    assert "Give --rows, --views or --bin" in done.output
-    assert "scans: 1/4" not in done.output
+    monkeypatch.setattr("beamline.reconstruct.energy_views.prepare_projections", None)
+    words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--memory", "1M"
+    for more in ((), ("--dry-run",)):
+        done = run("materials", *scans, *words, *more)
+        assert done.exit_code == 2
+        assert "Volumes of materials are not made in slabs: give --rows with 2 rows or fewer" in done.output
     assert not list(tmp_path.glob("out*"))
 
 
@@ -224,17 +265,21 @@ def test_ctrl_c_while_weights_are_tried_ends_with_the_volumes_so_far(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown: list[int] = []
+    monkeypatch.setattr(spectral, "weights_by_views", TRIED)
 
-    def interrupted(n: int, of: int) -> None:
-        shown.append(n)
-        if n == 3:
-            signal.raise_signal(signal.SIGINT)
+    def interrupted(sink: Sink, clock: Clock, seconds: float | None) -> Callable[[Progress], None]:
+        told = progress_events(sink, clock, seconds)
 
-    told = counting
-    monkeypatch.setattr(
-        "beamline.cli.materials.counting",
-        lambda stage, sink, clock: interrupted if stage.startswith("trial") else told(stage, sink, clock),
-    )
+        def heard(progress: Progress) -> None:
+            told(progress)
+            if progress.unit:  # of a trial
+                shown.append(progress.step)
+                if progress.step == 3:
+                    signal.raise_signal(signal.SIGINT)
+
+        return heard
+
+    monkeypatch.setattr("beamline.reconstruct.offline.progress_events", interrupted)
     done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
     assert done.exit_code == 4, done.output
     assert shown == [1, 2, 3]
@@ -255,7 +300,6 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
         return made[-1]
 
     monkeypatch.setattr("beamline.reconstruct.energy_views.prepare_projections", prepared)
-    monkeypatch.setattr("beamline.reconstruct.energy_series._SWEEPS", 1)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--rows", "0:1"
     done = run("materials", *scans[:2], *words)
     assert done.exit_code == code, done.output
@@ -265,7 +309,7 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
 def test_a_source_within_the_field_is_refused(scans: list[Path], tmp_path: Path) -> None:
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--cone", "0.01:0.02"
     done = run("materials", *scans[:2], *words)
-    assert done.exit_code == 2, done.output
+    assert done.exit_code == 5, done.output
     assert "the box reaches" in done.output
     assert not list(tmp_path.glob("out*"))
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
 from beamline.core.events import Event
-from beamline.reconstruct.progress import progress_events, sweeps_told
+from beamline.reconstruct.progress import progress_events
 from drivers.base.clock import SystemClock
 from recon.base.method import Progress
 
@@ -40,19 +40,3 @@ def test_a_fit_that_begins_anew_is_timed_anew() -> None:
     told = _told([(1, 1.0), (101, 2.0), (1, 10.0), (11, 11.0)], 0)
     assert [data["per_s"] for data in told] == [None, pytest.approx(100), None, pytest.approx(10)]
     assert told[-1]["eta_s"] is None
-
-
-def test_trials_are_told_with_those_that_follow_and_sweeps_from_the_end_of_the_last() -> None:
-    told: list[tuple[str, int, int]] = []
-    stages: list[str] = []
-
-    def counting(stage: str) -> Callable[[int, int], None]:
-        stages.append(stage)
-        return lambda n, of: told.append((stage, n, of))
-
-    listen = sweeps_told(counting, 2)
-    for sweep in (-5, -4, -1, 0, -1, 0, 1, 2):  # a search that ends early, a second stage, the fit
-        listen(sweep)
-    trials = [(1, 6), (2, 6), (3, 4), (4, 4), (1, 2), (2, 2)]
-    assert told == [*(("trial sweeps", *one) for one in trials), ("sweeps", 1, 2), ("sweeps", 2, 2)]
-    assert stages[-1] == "sweeps"  # whose clock starts when the last trial ends

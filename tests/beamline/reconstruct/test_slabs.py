@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.reconstruct import estimate
-from beamline.reconstruct.slabs import Needs
+from beamline.reconstruct.needs import Needs
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid

@@ -10,6 +10,7 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
+from beamline.reconstruct.energy_scans import EnergyScans, read_spectra
 from beamline.storage.readers.open import SourceOptions
 from beamline.trials.data import TrialData
 from beamline.trials.runner import ComparedScan
@@ -45,13 +46,14 @@ def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     assert [outcome.trial.group for outcome in table.outcomes] == ["method", "parts", "parts", *["one fit"] * 3]
 
 
+def at_energies(scans: list[Path], table: Path) -> EnergyScans:  # noqa: F811
+    return EnergyScans(tuple(map(SourceOptions, scans)), read_spectra(table))
+
+
 def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
     pytest.importorskip("xraylib")
-    first, *others = (asked(path, 31.5) for path in scans)
-    several = SeveralVolumes(
-        others=[(one.source, one.selection) for one in others], spectra=spectra(tmp_path), states=("fresh", "charged")
-    )
-    data, table = planned(first, several, lambda said: None)
+    several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "charged"))
+    data, table = planned(asked(scans[0], 31.5), several, lambda said: None)
     assert data.held_out is not None and data.sections is not None
     assert data.geometry.n_views == 84 and data.held_out[1].n_views == 12
     assert np.bincount(data.shown.astype(int)).tolist() == [24] * 4
@@ -65,12 +67,14 @@ def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path
 
 
 def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -> None:
+    pytest.importorskip("xraylib")
     (tmp_path / "out").mkdir()
+    several = SeveralVolumes(scans=at_energies([tmp_path / "none.h5"], spectra(tmp_path)))
     with pytest.raises(Exception, match="never overwritten"):
-        planned(asked(tmp_path / "none.h5", 1.0), SeveralVolumes(spectra=tmp_path / "none.csv"), print)
+        planned(asked(tmp_path / "none.h5", 1.0), several, print)
 
 
 def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
-    several = SeveralVolumes(spectra=spectra(tmp_path), states=("fresh", "full"))
+    several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "full"))
     with pytest.raises(ConfigError, match="expected two of the materials fresh, charged"):
         planned(asked(scans[0], 31.5), several, print)

@@ -23,9 +23,9 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
+from beamline.reconstruct.needs import Needs, needs_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
-from beamline.reconstruct.slabs import Needs, needs_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
