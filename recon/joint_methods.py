@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -48,8 +49,9 @@ class TimeSeries:
     weight: float | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.volumes, bool) or not isinstance(self.volumes, int) or self.volumes < 2:
-            raise ValueError(f"volumes must be a whole number, 2 or more, got {self.volumes!r}")
+        _require_whole("volumes", self.volumes, 2)
+        if self.moves not in (None, True, False):
+            raise ValueError(f"moves must be True, False or None, got {self.moves!r}")
         _require_fit(self.sweeps, self.weight)
 
     @property
@@ -59,7 +61,7 @@ class TimeSeries:
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         _require_own_grid(problem)
         n, times = problem.geometry.n_views, problem.use.times
-        times = np.arange(n, dtype=np.float64) if times is None else times
+        times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
         data, weights = _measured(problem)
         made = fit_series(
@@ -238,10 +240,14 @@ def _progress(n: int, of: int, unit: str) -> Progress:
 
 def _require_fit(sweeps: int, weight: float | None) -> None:
     """ValueError for other settings than a fit takes."""
-    if isinstance(sweeps, bool) or not isinstance(sweeps, int) or sweeps < 1:
-        raise ValueError(f"sweeps must be a whole number, 1 or more, got {sweeps!r}")
+    _require_whole("sweeps", sweeps, 1)
     if weight is not None and not (math.isfinite(weight) and weight >= 0):
         raise ValueError(f"weight must be finite and 0 or more, got {weight!r}")
+
+
+def _require_whole(name: str, value: int, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number, {least} or more, got {value!r}")
 
 
 def _require_own_grid(problem: ReconProblem) -> None:

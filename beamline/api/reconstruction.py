@@ -113,6 +113,9 @@ def reconstruct(
 
 
 def _method(method: str | Method) -> Method:
+    if isinstance(method, type):
+        name = method.__name__
+        raise ConfigError(f"method is the class {name}; give a name or an object, such as {name}(). Nothing was read.")
     if not isinstance(method, str):
         return method
     try:

@@ -22,6 +22,7 @@ from beamline.reconstruct.needs import (
     Needs,
     memory_of,
     needs_of,
+    refuse_few_views,
     refuse_slabs,
     refuse_smallest,
     refuse_whole,
@@ -99,6 +100,7 @@ def prepare_within(
             locate(options.region, options.selection, geometry)
         if options.method.traits.several:
             needs = Needs(options.method, geometry if views is None else repeated(geometry, views), 0, True)
+            refuse_few_views(source, options, needs.geometry)
             if needs.at_once > memory:
                 refuse_whole(source, options, needs, memory)
         if buffer is not None and not geometry.is_straight:
