@@ -6,8 +6,9 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,7 +17,7 @@ from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal, counting, events_shown
 from beamline.cli.xafs_curves import CurveJob, CurveOptions, run_job
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done
+from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
@@ -116,25 +117,7 @@ def charges_of(value: str) -> tuple[float, ...]:
 )
 @click.option("--least", type=FiniteRange(min=0, min_open=True), help="With --volume: least sum; 0.5 unless given.")
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
-def xafs(
-    sources: tuple[str, ...],
-    low: float | None,
-    high: float | None,
-    step: float | None,
-    material: str | None,
-    angle: float | None,
-    seed: int | None,
-    regions: Sequence[PixelBox],
-    charges: Sequence[float] | None,
-    around: PixelBox | None,
-    unit: str | None,
-    quantity: str | None,
-    output: Path | None,
-    volume: Path | None,
-    spectra: Path | None,
-    least: float | None,
-    as_json: bool,
-) -> None:
+def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_json: bool, **values: Any) -> None:
     """Find the energy at which a material of given thickness has the highest contrast to its surroundings, and its
     absorption edge.
 
@@ -148,45 +131,24 @@ def xafs(
     Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6: no edge was found;
     picture and table are written, too.
     """
-    from beamline.xafs import states
-    from beamline.xafs.results import lines, refuse_existing_results, table_beside, write, write_both
+    from beamline.xafs.results import refuse_existing_results
 
     target = output or Path(f"{Path(sources[-1]).stem}_xafs.png")
     if target.suffix.lower() != ".png":
         raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
     if volume is not None:
-        _charge_map(sources, volume, spectra, _LEAST_SUM if least is None else least, target, as_json)
+        _charge_map(sources, volume, values["spectra"], values["least"] or _LEAST_SUM, target, as_json)
         return
     _refuse_given(_OF_MAPS, "a map of volumes: give --volume PATH, too")
-    jobs = [job for source in sources for job in _jobs(source, regions, charges)]
-    options = CurveOptions(low, high, step, material, angle, seed, around, unit, quantity)
-    clock, stop = SystemClock(), StopRequest()
-    results: list[XafsResult] = []
-    with json_events(as_json) as json_sink, ExitStack() as opened:
+    jobs = [job for source in sources for job in _jobs(source, values["regions"], values["charges"])]
+    options = CurveOptions(**{field.name: values[field.name] for field in fields(CurveOptions)})
+    stop = StopRequest()
+    with json_events(as_json) as json_sink, stop_signals(stop):
         refuse_existing_results(target)
-        opened.enter_context(stop_signals(stop))
-        with Terminal(sys.stderr) as terminal:
-            sink = json_sink if as_json else terminal
-            for job in jobs:
-                run, title = run_job(job, options, len(jobs) > 1, sink, stop)
-                try:
-                    results.append(_result(title, run))
-                except ScanStopped:
-                    if not results:
-                        raise
-                if stop.stopping:
-                    break
-        if len(jobs) == 1:
-            write(results[0], target)
-            shown_lines, data = lines(results[0]), results[0].data()
-        else:
-            write_both(states.picture(results), states.table(results), target)
-            shown_lines, data = states.lines(results), states.data(results)
-        stopped = run.stopped or len(results) < len(jobs)
-        data |= {"picture": target, "table": table_beside(target), "stopped": stopped}
-        json_sink(Done(data, time=clock.now()))
+        results, stopped = _curves(jobs, options, stop, json_sink if as_json else None)
+        shown_lines = _write(results, len(jobs), target, stopped, json_sink)
     if not as_json:
-        click.echo("\n".join([*shown_lines, f"written     {target}, {table_beside(target)}"]))
+        click.echo("\n".join(shown_lines))
     if stopped:
         n = sum(result.curve.energies.size + result.curve.left_out.size for result in results)
         raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
@@ -194,6 +156,46 @@ def xafs(
         where = "" if len(jobs) == 1 else f" in {without[0].title}"
         why = "; ".join(part for part in (without[0].edge.reason, without[0].tabulated) if part)
         raise QualityError(f"No absorption edge was found{where}: {why}. Picture and table were written.")
+
+
+def _curves(
+    jobs: Sequence[CurveJob], options: CurveOptions, stop: StopRequest, json_sink: Sink | None
+) -> tuple[list[XafsResult], bool]:
+    """The edges of the curves, and whether a stop left some of them out.
+
+    Raises:
+        ScanStopped: before there was one.
+    """
+    stopped = False
+    results: list[XafsResult] = []
+    with Terminal(sys.stderr) as terminal:
+        for job in jobs:
+            run, title = run_job(job, options, len(jobs) > 1, json_sink or terminal, stop)
+            try:
+                results.append(_result(title, run))
+            except ScanStopped:
+                if not results:
+                    raise
+            stopped = run.stopped
+            if stop.stopping:
+                break
+    return results, stopped or len(results) < len(jobs)
+
+
+def _write(results: Sequence[XafsResult], jobs: int, target: Path, stopped: bool, json_sink: Sink) -> list[str]:
+    """Write picture and table, send the event `done`, and return the lines to print."""
+    from beamline.xafs import states
+    from beamline.xafs.results import lines, table_beside, write, write_both
+
+    if jobs == 1:
+        write(results[0], target)
+        shown_lines, data = lines(results[0]), results[0].data()
+    else:
+        write_both(states.picture(results), states.table(results), target)
+        shown_lines, data = states.lines(results), states.data(results)
+    data |= {"picture": target, "table": table_beside(target), "stopped": stopped}
+    json_sink(Done(data, time=SystemClock().now()))
+    return [*shown_lines, f"written     {target}, {table_beside(target)}"]
 
 
 def _jobs(source: str, regions: Sequence[PixelBox], charges: Sequence[float] | None) -> list[CurveJob]:

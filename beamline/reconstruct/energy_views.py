@@ -19,6 +19,7 @@ from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.energy_scans import EnergyScans
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from recon.base.method import Energies
 from recon.energy_fit import EnergyViews
@@ -29,20 +30,18 @@ _PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this share: views 
 _ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
 
 
-def stated_views(scans: EnergyScans, selection: Selection) -> Geometry:
-    """The views of all scans, as the first one states them, before any frame is read."""
-    with scans.scans[0].open() as first:
-        geometry = stated_geometry(first, selection)
-    views = geometry.n_views
-    for each in scans.scans[1:]:
-        with each.open() as source:
-            views += stated_geometry(source, selection).n_views
-    return repeated(geometry, views)
+def views_of_others(source: SourceOptions | EnergyScans, selection: Selection) -> int:
+    """Views of the scans after the first one, before any frame is read; 0 where there is one scan."""
+    views = 0
+    for each in source.scans[1:] if isinstance(source, EnergyScans) else ():
+        with each.open() as scan:
+            views += stated_geometry(scan, selection).n_views
+    return views
 
 
 def repeated(geometry: Geometry, views: int) -> Geometry:
     """So many views like these."""
-    return geometry.select(np.resize(np.arange(geometry.n_views), views))
+    return geometry if views == geometry.n_views else geometry.select(np.resize(np.arange(geometry.n_views), views))
 
 
 def prepare_energies(

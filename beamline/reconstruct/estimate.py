@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from beamline.core.errors import DataError
 from beamline.core.text import count, size
 from beamline.projections.view_geometry import stated_geometry
-from beamline.reconstruct.energy_scans import EnergyScans
-from beamline.reconstruct.energy_views import stated_views
+from beamline.reconstruct.energy_views import repeated, views_of_others
 from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.needs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.reconstruct.options import ReconOptions
@@ -91,8 +90,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     with options.source.open() as source:
         options = options.around_region(source)
         geometry = stated_geometry(source, options.selection)
-        if isinstance(options.source, EnergyScans):
-            geometry = stated_views(options.source, options.selection)
+        geometry = repeated(geometry, geometry.n_views + views_of_others(options.source, options.selection))
         allowed, needs = memory_of(options), needs_of(source, options)
         shape = Grid.matching(geometry).shape
         slabs = missing = slabs_of(shape[0], shape[0], 0)

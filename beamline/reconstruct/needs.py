@@ -20,8 +20,7 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import choose_views, rows_of
 from beamline.projections.step import StepMemory
 from beamline.reconstruct.cluster import local_workers
-from beamline.reconstruct.energy_scans import EnergyScans
-from beamline.reconstruct.energy_views import stated_views
+from beamline.reconstruct.energy_views import views_of_others
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slurm import is_slurm, slurm_jobs
 from beamline.storage.readers.base import ScanSource
@@ -169,9 +168,8 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     """
     selection = options.selection
     rows, frames = rows_of(source, selection), np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    views = chosen = choose_views(source, frames, selection).size
-    if isinstance(options.source, EnergyScans):
-        views = stated_views(options.source, selection).n_views
+    chosen = choose_views(source, frames, selection).size
+    views = chosen + views_of_others(options.source, selection)
     shape = (rows.stop - rows.start) // selection.binning, source.shape[1] // selection.binning
     axis = source.axis_col if selection.axis_col is None else selection.axis_col
     if axis is not None:

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from math import nan
 from pathlib import Path
 from typing import Any, TypeVar
@@ -70,67 +70,117 @@ def in_slabs(
     Raises:
         DataError: the views are zero everywhere, or the partial volume is of other data or options.
     """
-    grid, begin = Grid.matching(prepared.geometry), control.now()
-    made_from, partial = _made_from(prepared, options), None
-    if options.partial is not None:
-        partial = open_partial(options.partial)
-        refuse_other(options.partial, made_from, partial.made_from, "reconstruction")
-        say(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
-    in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
-
-    def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
-        """The slab, and a sentence on it; None for views that are zero."""
-        slab, follows = slabs[n], partial is not None
-        control_of_slab = replace(
-            control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0])
-        )
-        rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
-        part = prepared.of_rows(rows, geometry)
-        if not part.projections.data.any():
-            return None, ""
-        try:
-            method = for_part(options.method, slab.slices.stop - slab.slices.start, grid.shape[0], in_all)
-            return by(method, part, box, control_of_slab), ""
-        except DataError as error:
-            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
-            if not follows or not options.method.traits.needs_matter:
-                raise
-            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
-            return by(FistaTv(), part, box, control_of_slab), remark
-
-    def progress(n: int) -> None:
-        say(f"Slab {n + 1} of {len(slabs)}: slices {slabs[n].own.start} to {slabs[n].own.stop - 1}.")
-
-    missing = [n for n in busiest_first(prepared, grid, slabs) if partial is None or not partial.has(n)]
-    while partial is None:
-        if not missing:
-            raise DataError("The views are zero everywhere: there is nothing in the beam.")
-        progress(n := missing.pop(0))
-        decide = Decisions(options.seed)
-        if (first_slab := made(n, run, decide, 0)[0]) is not None:
-            record = _record(prepared, options, grid, begin)
-            partial = create_partial(options.partial_path, record, slabs, made_from, _kept(first_slab, decide))
-            partial.add(n, first_slab.volume.data)
-        del first_slab  # no slab is in memory while the next one is made
+    job = _SlabJob(run, prepared, options, slabs, control, say)
+    partial = job.resumed()
+    missing = [n for n in busiest_first(prepared, job.grid, slabs) if partial is None or not partial.has(n)]
+    if partial is None:
+        partial, missing = job.begun(missing)
     decided = partial.kept["decided"]
     if workers is None:
         for n in missing:
-            progress(n)
-            _add(partial, n, *made(n, run, Decisions(options.seed, decided), partial.n_slices_done), warn)
+            job.announce(n)
+            decide = Decisions(options.seed, decided)
+            _add(partial, n, *job.made(n, run, decide, partial.n_slices_done, first=False), warn)
     else:
+        worker = workers.run
 
         def by_worker(n: int) -> tuple[Reconstruction | None, str]:
-            return made(n, workers.run, Decisions(options.seed, decided), 0)
+            return job.made(n, worker, Decisions(options.seed, decided), 0, first=False)
 
         for n, (result, remark) in _as_they_come(by_worker, missing, workers.count):
             _add(partial, n, result, remark, warn)
-            say(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
-            if (listen := control.on_progress) is not None:
-                seconds, views = control.now() - begin, prepared.geometry.n_views
-                listen(Progress(partial.n_slices_done, grid.shape[0], seconds, nan, nan, 0, views, unit="slices"))
+            job.tell(partial.n_slices_done)
     if control.decide is not None:
         control.decide.made.update(decided)
-    return _whole(partial, grid, options, control.now() - begin)
+    return _whole(partial, job.grid, options, control.now() - job.begin)
+
+
+@dataclass(frozen=True, eq=False)
+class _SlabJob:
+    """The slabs of one volume; arguments as of `in_slabs`."""
+
+    run: RunMethod
+    prepared: PreparedProjections
+    options: ReconOptions
+    slabs: Sequence[Slab]
+    control: RunControl
+    say: Callable[[str], None]
+    begin: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "begin", self.control.now())
+
+    @property
+    def grid(self) -> Grid:
+        return Grid.matching(self.prepared.geometry)
+
+    def announce(self, n: int) -> None:
+        own = self.slabs[n].own
+        self.say(f"Slab {n + 1} of {len(self.slabs)}: slices {own.start} to {own.stop - 1}.")
+
+    def tell(self, done: int) -> None:
+        """So many slices are there."""
+        slices = self.grid.shape[0]
+        self.say(f"{done} of {slices} slices are there.")
+        if (listen := self.control.on_progress) is not None:
+            seconds, views = self.control.now() - self.begin, self.prepared.geometry.n_views
+            listen(Progress(done, slices, seconds, nan, nan, 0, views, unit="slices"))
+
+    def resumed(self) -> PartialVolume | None:
+        """The partial volume that is to be completed; None: a new one. DataError where it is of something else."""
+        if (path := self.options.partial) is None:
+            return None
+        partial = open_partial(path)
+        refuse_other(path, _made_from(self.prepared, self.options), partial.made_from, "reconstruction")
+        self.say(f"{partial.n_slices_done} of {self.grid.shape[0]} slices are there.")
+        return partial
+
+    def begun(self, numbers: Sequence[int]) -> tuple[PartialVolume, list[int]]:
+        """A new partial volume with the first of these slabs that shows anything, and the slabs after it.
+
+        Raises:
+            DataError: none does.
+        """
+        for at, n in enumerate(numbers):
+            self.announce(n)
+            decide = Decisions(self.options.seed)
+            slab, _ = self.made(n, self.run, decide, 0, first=True)
+            if slab is None:
+                continue
+            record = _record(self.prepared, self.options, self.grid, self.begin)
+            made_from = _made_from(self.prepared, self.options)
+            path, kept = self.options.partial_path, _kept(slab, decide)
+            partial = create_partial(path, record, self.slabs, made_from, kept)
+            partial.add(n, slab.volume.data)
+            return partial, list(numbers[at + 1 :])
+        raise DataError("The views are zero everywhere: there is nothing in the beam.")
+
+    def made(
+        self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool
+    ) -> tuple[Reconstruction | None, str]:
+        """The slab, and a sentence on it; None for views that are zero.
+
+        Args:
+            done: slices that are there before it.
+            first: of all slabs, whose decisions the others follow.
+        """
+        slab, slices, method = self.slabs[n], self.grid.shape[0], self.options.method
+        listen = _of_all(self.control, self.begin, done, slab, slices)
+        control = replace(self.control, decide=decide, on_progress=listen)
+        rows, geometry, box = part_of(self.prepared.geometry, self.grid, slab.slices)
+        part = self.prepared.of_rows(rows, geometry)
+        if not part.projections.data.any():
+            return None, ""
+        in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)
+        try:
+            own = for_part(method, slab.slices.stop - slab.slices.start, slices, in_all)
+            return by(own, part, box, control), ""
+        except DataError as error:
+            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
+            if first or not method.traits.needs_matter:
+                raise
+            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
+            return by(FistaTv(), part, box, control), remark
 
 
 def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:

@@ -17,7 +17,7 @@ from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import cone_of
 from beamline.reconstruct.energy_scans import EnergyScans
-from beamline.reconstruct.energy_views import prepare_energies, repeated, stated_views
+from beamline.reconstruct.energy_views import prepare_energies, repeated, views_of_others
 from beamline.reconstruct.needs import (
     Needs,
     memory_of,
@@ -92,14 +92,13 @@ def prepare_within(
     memory = memory_of(options)
     buffer = disk_buffer_of(source, options, progress, say)
 
-    scans = options.source if isinstance(options.source, EnergyScans) else None
-    views = None if scans is None else stated_views(scans, options.selection).n_views
+    others = views_of_others(options.source, options.selection)
 
     def check(geometry: Geometry) -> None:
         if options.region is not None:
             locate(options.region, options.selection, geometry)
         if options.method.traits.several:
-            needs = Needs(options.method, geometry if views is None else repeated(geometry, views), 0, True)
+            needs = Needs(options.method, repeated(geometry, geometry.n_views + others), 0, True)
             refuse_few_views(source, options, needs.geometry)
             if needs.at_once > memory:
                 refuse_whole(source, options, needs, memory)
@@ -109,8 +108,8 @@ def prepare_within(
                 "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
             )
 
-    if scans is not None:
-        return prepare_energies(scans, options.selection, warn, check, phases), []
+    if isinstance(options.source, EnergyScans):
+        return prepare_energies(options.source, options.selection, warn, check, phases), []
     prepared = prepare_projections(source, options.selection, warn, buffer, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if method.traits.in_time:

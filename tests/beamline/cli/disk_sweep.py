@@ -41,7 +41,7 @@ _MODULES = {
     "export": "cli.export",
     "ingest": "cli.files storage.ingest",
     "archive": "cli.files",
-    "recon": "cli.recon reconstruct.offline reconstruct.recon_report report.figures",
+    "recon": "cli.recon reconstruct.job reconstruct.offline reconstruct.recon_report report.figures",
     "segment": "cli.segment",
     "tradeoff": "cli.tradeoff trials.tradeoff",
     "study": "cli.study trials.study trials.figures",

@@ -279,7 +279,7 @@ def test_ctrl_c_while_weights_are_tried_ends_with_the_volumes_so_far(
 
         return heard
 
-    monkeypatch.setattr("beamline.reconstruct.offline.progress_events", interrupted)
+    monkeypatch.setattr("beamline.reconstruct.job.progress_events", interrupted)
     done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
     assert done.exit_code == 4, done.output
     assert shown == [1, 2, 3]

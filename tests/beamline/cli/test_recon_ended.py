@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.reconstruct import budget, checkpoints, offline
+from beamline.reconstruct import budget, checkpoints, job, offline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
@@ -109,7 +109,7 @@ def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, mo
 
         return heard
 
-    monkeypatch.setattr(offline, "progress_events", watched)
+    monkeypatch.setattr(job, "progress_events", watched)
     result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "100000", "--no-report")
     assert result.exit_code == 4, result.output
     assert "The reconstruction was stopped early" in result.stderr

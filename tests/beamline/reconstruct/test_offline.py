@@ -16,7 +16,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct import checkpoints, offline
+from beamline.reconstruct import checkpoints, job
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
@@ -146,7 +146,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
     def compiled(method: R2 | None = None, geometry: object = None, **others: object) -> None:
         asked.append({"method": method or R2(), "geometry": geometry})
 
-    monkeypatch.setattr(offline, "warm_up", compiled)
+    monkeypatch.setattr(job, "warm_up", compiled)
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)
     reconstruct_file(_options(tmp_path, selection=selection, **changes), lambda event: None, SystemClock())
     assert len(asked) == 1

@@ -20,7 +20,7 @@ import pytest
 
 from beamline.projections.selection import Selection
 from beamline.reconstruct import estimate, result
-from beamline.reconstruct import slabs as module
+from beamline.reconstruct import needs as module
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slab_run import _as_they_come
