@@ -33,8 +33,8 @@ from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
-from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
