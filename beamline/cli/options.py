@@ -6,10 +6,11 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from datetime import datetime
+from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -152,6 +153,50 @@ def together(*options: Decorator) -> Decorator:
         return command
 
     return add
+
+
+def set_by(*options: Decorator | str, **facts: Any) -> Any:
+    """A field of a command's request, and the option that sets it.
+
+    Args:
+        options: names of the option, or an option or argument whose parameter is named as the field; after headings.
+        facts: as of `option`, beside names.
+    """
+    return field(metadata={"options": options, "facts": facts})
+
+
+def others(*options: Decorator) -> Any:
+    """The field of a request that has the values of these options, which are no fields, by parameter name."""
+    return field(metadata={"options": options})
+
+
+def with_request(request: type) -> Decorator:
+    """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
+
+    Args:
+        request: a frozen dataclass whose fields are made by `set_by`, and one of them perhaps by `others`.
+    """
+    fields_of = {each.name: each.metadata for each in fields(request)}
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def call(**values: Any) -> Any:
+            own = {name: values.pop(name) for name, made in fields_of.items() if "facts" in made}
+            return command(request(**own, **{name: values for name in fields_of if name not in own}))
+
+        return together(*(each for name, made in fields_of.items() for each in _options_of(name, **made)))(call)
+
+    return add
+
+
+def _options_of(
+    field: str, options: Sequence[Decorator | str], facts: Mapping[str, Any] | None = None
+) -> list[Decorator]:
+    """The headings and the option of a field."""
+    names = [each for each in options if isinstance(each, str)]
+    return [each for each in options if not isinstance(each, str)] + (
+        [option(*names, field, **(facts or {}))] if names else []
+    )
 
 
 def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
