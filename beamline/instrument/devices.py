@@ -15,7 +15,7 @@ from drivers.base.clock import Clock
 from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors.page import PageSource
 from drivers.beam_monitors.reading import TextBeamMonitor, TextSource
-from drivers.beam_monitors.serial import SerialSource
+from drivers.beam_monitors.serial import ElectrometerQuery, SerialSource
 from drivers.epics.devices import PvSource
 from drivers.frame_memory import FrameMemory
 
@@ -95,12 +95,9 @@ def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig | EpicsBeam
         source = SerialSource(
             simulated_electrometer(clock, end) if config.simulated else config.port,
             clock,
-            query=config.query,
-            pattern=config.pattern,
-            setup=config.setup,
+            ElectrometerQuery(config.query, config.pattern, config.setup, end),
             timeout=config.timeout_s,
             baudrate=config.baudrate,
-            line_end=end,
             transcript=None if config.transcript is None else Path(config.transcript),
         )
     return TextBeamMonitor(source, clock, pattern=pattern, unit=config.unit, scale=config.scale)

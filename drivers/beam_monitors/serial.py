@@ -8,16 +8,38 @@ not checked against its manual: check them on yours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.beam_monitors.reading import within_a_line
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import Framing
 
 QUERY = "READ?"
 PATTERN = r"^\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)"
+
+
+@dataclass(frozen=True)
+class ElectrometerQuery:
+    """How an electrometer is read.
+
+    Attributes:
+        query: command that asks for a reading; it must have no side effects, since it is also the line's probe (see
+            `SerialLine`).
+        pattern: regular expression that every reply contains; any other reply counts as a disturbed line.
+        setup: commands without a reply, sent once before the first query.
+        line_end: of commands and replies.
+    """
+
+    query: str = QUERY
+    pattern: str = PATTERN
+    setup: Sequence[str] = ()
+    line_end: bytes = b"\r\n"
+
+
+_USUAL = ElectrometerQuery()
 
 
 class SerialSource:
@@ -25,12 +47,7 @@ class SerialSource:
 
     Args:
         url: pyserial URL.
-        query: command that asks for a reading; it must have no side effects, since it is also the line's probe (see
-            `SerialLine`).
-        pattern: regular expression that every reply contains; any other reply counts as a disturbed line.
-        setup: commands without a reply, sent once before the first query.
-        line_end: of commands and replies.
-        transcript: see `SerialLine`.
+        timeout, baudrate, transcript: see `SerialLine`.
 
     Raises:
         DeviceError: the port does not open. DeviceRefused: an empty query.
@@ -40,32 +57,28 @@ class SerialSource:
         self,
         url: str,
         clock: Clock,
+        reading: ElectrometerQuery = _USUAL,
         *,
-        query: str = QUERY,
-        pattern: str = PATTERN,
-        setup: Sequence[str] = (),
         timeout: float = 2.0,
         baudrate: int = 9600,
-        line_end: bytes = b"\r\n",
         name: str = "beam monitor",
         transcript: Path | None = None,
     ) -> None:
-        self.request = query
-        self._form = within_a_line(pattern)
-        if not query:
+        self.request = reading.query
+        self._form = within_a_line(reading.pattern)
+        if not self.request:
             raise DeviceRefused(name, "the query is empty", state="Nothing was sent")
         self._line = SerialLine(
             url,
+            LineRules(Probe(self.request, self._form), framing=Framing(reading.line_end, reading.line_end)),
+            clock,
             device=name,
-            probe=Probe(query, self._form),
-            clock=clock,
             timeout=timeout,
             baudrate=baudrate,
-            framing=Framing(line_end, line_end),
             transcript=transcript,
         )
         try:
-            for command in setup:
+            for command in reading.setup:
                 self._line.send(command)
         except DeviceError:
             self.close()

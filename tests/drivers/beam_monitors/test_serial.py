@@ -5,13 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors.reading import TextBeamMonitor
-from drivers.beam_monitors.serial import PATTERN, SerialSource
+from drivers.beam_monitors.serial import PATTERN, ElectrometerQuery, SerialSource
 from simulators.devices.clock import VirtualClock
 from simulators.wires.electrometer import OVER_RANGE, ElectrometerWire
 from simulators.wires.serial_url import register
@@ -19,8 +20,9 @@ from simulators.wires.serial_url import register
 NAMES = (f"electrometer-{number}" for number in itertools.count())
 
 
-def over(wire: ElectrometerWire, **options: object) -> BeamMonitor:
-    source = SerialSource(register(next(NAMES), wire), wire.clock, timeout=0.5, **options)  # type: ignore[arg-type]
+def over(wire: ElectrometerWire, transcript: Path | None = None, **query: Any) -> BeamMonitor:
+    url, asked = register(next(NAMES), wire), ElectrometerQuery(**query)
+    source = SerialSource(url, wire.clock, asked, timeout=0.5, transcript=transcript)
     return TextBeamMonitor(source, wire.clock, pattern=PATTERN, unit="A")
 
 
