@@ -57,7 +57,7 @@ class TradeoffRequest:
     truth: str | None = set_by(
         "--truth",
         excludes=dict.fromkeys(
-            ("volumes", "spectra"), "it is one volume; views in time, or of several energies, show several"
+            ("time", "spectra"), "it is one volume; views in time, or of several energies, show several"
         ),
         metavar="FILE[:A:B]",
         help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
