@@ -1,7 +1,7 @@
 """Devices: the composition root, where a configuration becomes the devices of an instrument.
 
-Each driver has a module of its own; `simulated` makes all devices where the instrument is simulated, and is the only
-one that names a simulator. A camera waits for its cold sensor before a scan.
+Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
+that names a simulator.
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ from drivers.base.protocols import (
     TriggerSource,
     Watchable,
 )
-from drivers.beam_monitors.reading import PageSource, SerialSource, TextBeamMonitor, TextSource
+from drivers.beam_monitors.page import PageSource
+from drivers.beam_monitors.reading import TextBeamMonitor, TextSource
+from drivers.beam_monitors.serial import ElectrometerQuery, SerialSource
 from drivers.epics.devices import PvShutter, PvSource
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
@@ -129,12 +131,9 @@ def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig | EpicsBeam
         source = SerialSource(
             simulated_electrometer(clock, end) if config.simulated else config.port,
             clock,
-            query=config.query,
-            pattern=config.pattern,
-            setup=config.setup,
+            ElectrometerQuery(config.query, config.pattern, config.setup, end),
             timeout=config.timeout_s,
             baudrate=config.baudrate,
-            line_end=end,
             transcript=None if config.transcript is None else Path(config.transcript),
         )
     return TextBeamMonitor(source, clock, pattern=pattern, unit=config.unit, scale=config.scale)

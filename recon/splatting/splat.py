@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,29 +24,38 @@ from recon.splatting.gaussians import Gaussians, turned_by_rows
 Implementation = Literal["auto", "cpu", "gpu", "reference"]
 
 
+class _On(NamedTuple):
+    """What raw parameters are of, and what computes them; `unit` is that of the densities."""
+
+    unit: float
+    kernel: Kernel
+    backend: Backend[Any]
+
+
 class Project(torch.autograd.Function):
     """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], geometry: Geometry, faint: float, cut: float, model: RayModel,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: _On, geometry: Geometry,
+        how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
+        """Images [view, row, col]; `how` is what is too faint, the truncation in standard deviations, and the rays."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), geometry, (faint, cut, model)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
+        ctx.given = on, geometry, how
+        run = _begin((means, log_scales, quaternions, raw), on)
         images = means.new_empty((geometry.n_views, *geometry.detector_shape))
         for view, image in enumerate(images):
-            image.copy_(torch.as_tensor(run.view(geometry, view, faint, cut, model).image))
+            image.copy_(torch.as_tensor(run.view(geometry, view, *how).image))
         return images
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
         on, geometry, how = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
+        run = _begin(ctx.saved_tensors, on)
         for view, slope in enumerate(gradient):
-            run.view(geometry, view, *how).backward(_native(slope, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 7)
+            run.view(geometry, view, *how).backward(_native(slope, on.backend))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
 class Voxelize(torch.autograd.Function):
@@ -54,25 +63,26 @@ class Voxelize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], grid: Grid, faint: float, cut: float,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: _On, grid: Grid,
+        how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
+        """Density [z, y, x]; `how` is what is too faint, and the truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), (grid, faint, cut)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
-        return torch.as_tensor(run.box(grid, faint, cut).density)
+        ctx.given = on, grid, how
+        run = _begin((means, log_scales, quaternions, raw), on)
+        return torch.as_tensor(run.box(grid, *how).density)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, where = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
-        run.box(*where).backward(_native(gradient, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 6)
+        on, grid, how = ctx.given
+        run = _begin(ctx.saved_tensors, on)
+        run.box(grid, *how).backward(_native(gradient, on.backend))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
-def _begin(parameters: Sequence[Tensor], unit: float, kernel: Kernel, backend: Backend[Any]) -> Pass[Any]:
-    means, log_scales, quaternions, raw = (_native(tensor, backend) for tensor in parameters)
-    return backend.begin(means, log_scales, quaternions, raw, unit, kernel)
+def _begin(parameters: Sequence[Tensor], on: _On) -> Pass[Any]:
+    means, log_scales, quaternions, raw = (_native(tensor, on.backend) for tensor in parameters)
+    return on.backend.begin(means, log_scales, quaternions, raw, on.unit, on.kernel)
 
 
 def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
@@ -116,7 +126,7 @@ def project(
             )
         return torch.stack(images)
     cut = truncation or Truncation()
-    return Project.apply(*_raw(g, which), chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+    return Project.apply(*_raw(g, which), chosen, (_faint(cut, g, chosen), cut.sigmas, rays))
 
 
 def voxelize(
@@ -128,7 +138,7 @@ def voxelize(
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
         return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
     cut = truncation or Truncation()
-    return Voxelize.apply(*_raw(g, which), grid, cut.faint * g.density_unit, cut.sigmas)
+    return Voxelize.apply(*_raw(g, which), grid, (cut.faint * g.density_unit, cut.sigmas))
 
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
@@ -139,7 +149,7 @@ def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
         backend: Backend[Any] = Gpu(g.means.device)
     else:
         backend = Cpu()
-    return g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, g.kernel, backend
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, _On(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
