@@ -20,7 +20,7 @@ from recon.base.arrays import F32, F64, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.noise_balance import NoiseBalance, determined
+from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
@@ -231,9 +231,7 @@ def choose_weight(
     def chosen() -> list[float]:
         balance = NoiseBalance.of(problem, start, modelled)
         judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
-        # The search begins higher where views leave much undetermined: there the noise asks for too little of a prior.
-        first = balance.first * 2.0 ** -round(math.log2(determined(problem.projector.geometry)))
-        preferred = None if judge is None else preferred_strength(judge.of_weight, first, alike_of(problem))
+        preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
         if judge is None or preferred is None:
             return [balance.first, balance.noise]
         judge.keep("weight", preferred)
