@@ -216,7 +216,7 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float, alike
 
 
 def choose_weight(
-    problem: VoxelProblem, start: F32, *, modelled: bool, trial: Callable[[], HeldOutTrial | None] | None = None
+    problem: VoxelProblem, start: F32, sweeps: int, trial: Callable[[], HeldOutTrial | None] | None = None
 ) -> NoiseBalance | float:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by views held out, where there are any, else by the noise.
 
@@ -224,12 +224,12 @@ def choose_weight(
     held out, and any weight takes it away from them.
 
     Args:
-        start, modelled: as of `NoiseBalance.of`.
+        start, sweeps: as of `NoiseBalance.of`.
         trial: gives that of this problem; None: `HeldOutTrial.of`.
     """
 
     def chosen() -> list[float]:
-        balance = NoiseBalance.of(problem, start, modelled)
+        balance = NoiseBalance.of(problem, start, sweeps)
         judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
         preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
         if judge is None or preferred is None:
@@ -238,7 +238,7 @@ def choose_weight(
         return [preferred.strength]
 
     first, *noise = problem.decide("weight", chosen)
-    return NoiseBalance(first, noise[0]) if noise else first
+    return NoiseBalance(first, noise[0], sweeps) if noise else first
 
 
 class WideViews(NamedTuple):

@@ -23,7 +23,7 @@ _SHARE = 0.75  # of the weight by the first volume
 _MOST = 4.0  # times the first weight
 # Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-_TOO_NOISY = 1.5  # times a model's residual: larger "noise" is fine structure
+_SETTLED = 3 / 8  # of the sweeps: OS-SIRT-TV with 3 of 40 ended a cement in a cone of 50 views 5.6 dB lower
 
 
 @dataclass(eq=False)
@@ -35,57 +35,54 @@ class NoiseBalance:
     is the first weight times (σ / s)², at least once and at most four times it, where s is the noise-like part of the
     residual. It rises where the residual has less noise than the data, since then the volume has taken it up. Rings and
     errors of the geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So
-    from sweep `settled` on, where s is larger than σ, it takes the place of σ: (s / σ)² times the first weight, at most
-    four times. Here s is the least so far, so that the weight only falls.
+    when three eighths of the sweeps are done, an s larger than σ takes its place: the weight is (s / σ)² times the
+    first one, at most four times. Here s is the least so far, so that the weight only falls.
 
     Attributes:
         first: the weight to begin with.
         noise: of a ray, with which the residual is compared: `noise_beside_structure` of the data. For many views it is
             up to 1.3 times that (π / 2 times the columns determine a slice). Then little of it fits into a volume.
-        settled: sweeps after which the residual is looked at. Before, a method that has not converged seems to leave
-            what no volume explains. Then the weight would be too heavy, and the residual large, up to the end.
+        sweeps: of the method. After three eighths of them the residual is looked at. Before, a method that has not
+            converged seems to leave what no volume explains. Then the weight would be too heavy, and the residual
+            large, up to the end.
     """
 
     first: float
     noise: float
-    settled: int = 3
+    sweeps: int
     value: float = field(init=False)
-    _sweeps: int = field(default=0, init=False)
+    _done: int = field(default=0, init=False)
     _least: float = field(default=math.inf, init=False)
 
     def __post_init__(self) -> None:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, evenly: bool = True) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, sweeps: int, evenly: bool = True) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
-            modelled: the start is a model of the sample. Then what it leaves of the data bounds the noise, which fine
-                structure, or a scan of few rows, makes too large.
+            sweeps: of the method.
             evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
                 views is alike.
         """
         data = whitened(problem.data, problem.weight)
         noise = noise_beside_structure(data, problem.projector.geometry) if evenly else noise_level(data)
-        if modelled:
-            left = whitened(problem.data - problem.projector.forward_lines(start), problem.weight)
-            noise = min(noise, _TOO_NOISY * noise_level(left))
         first = problem.filtered("hann")
         volume = start if first is None else np.maximum(first, 0, out=first)
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        return cls(share, noise * _by_views(problem.projector.geometry))
+        return cls(share, noise * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
         """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""
-        self._sweeps += 1
+        self._done += 1
         deviation = median_deviation(residual)
         if not (deviation > 0 and self.noise > 0):
             return self.value
         self._least = min(self._least, deviation / self.noise)
-        unexplained = self._sweeps >= self.settled and self._least > 1
+        unexplained = self._done >= math.ceil(_SETTLED * self.sweeps) and self._least > 1
         ratio = self._least if unexplained else self.noise / deviation
         factor = float(np.clip(ratio**2, 1.0, _MOST))
         self.value = self.first * factor
