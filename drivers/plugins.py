@@ -19,7 +19,7 @@ _PREFIX = "splatline."
 
 
 def plugins(
-    kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
+    kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, target: target
 ) -> dict[str, Any]:
     """The additions of other packages to a registry, by name, in the order of the names.
 
@@ -32,28 +32,28 @@ def plugins(
         UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
     """
     announced = sorted(point for point in _announced() if point.group == _PREFIX + kind)
-    times, found = Counter(point.name for point in announced), dict[str, Any]()
+    times, loaded = Counter(point.name for point in announced), dict[str, Any]()
     for point in announced:
         try:
             if point.name in taken or times[point.name] > 1:
                 by = "splatline" if point.name in taken else "another plug-in"
                 raise ValueError(f"the name is taken by {by}; expected a name of its own")
             with redirect_stdout(sys.stderr):  # stdout is for results
-                found[point.name] = made(point.name, point.load())
+                loaded[point.name] = made(point.name, point.load())
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # another package's fault must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
-            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {_said(error)}"
+            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {_message(error)}"
             warnings.warn(
                 f"The {kind.replace('_', ' ')} {_one_line(told)}. Mend or uninstall that package; all else works "
                 "without it.",
                 stacklevel=2,
             )
-    return found
+    return loaded
 
 
-def _said(error: BaseException) -> str:
+def _message(error: BaseException) -> str:
     try:
         return str(error)
     except BaseException as again:  # from the text of another package's error, too
@@ -69,5 +69,5 @@ def _one_line(text: str) -> str:
 @cache
 def _announced() -> tuple[EntryPoint, ...]:
     """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
-    found = entry_points()
-    return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))
+    groups = entry_points()
+    return tuple(point for group in groups.groups if group.startswith(_PREFIX) for point in groups.select(group=group))

@@ -51,15 +51,15 @@ def _distinct(*checks: Check) -> tuple[Check, ...]:
 
 def _plugged(ours: tuple[Check, ...]) -> tuple[Check, ...]:
     """Those of other packages."""
-    found = ours
+    checks = ours
 
     def made(name: str, kind: Callable[[], Check]) -> Check:
-        nonlocal found
+        nonlocal checks
         check = kind()
         if check.name != name:
             raise ValueError(f"its class calls itself {check.name!r}; expected the entry point's name")
         _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
-        found = _distinct(*found, check)
+        checks = _distinct(*checks, check)
         return check
 
     return tuple(plugins("check", {check.name for check in ours}, made).values())
@@ -80,7 +80,7 @@ def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
     for check, level in frames:
         if level is Level.WARN:
             frames[check, level] -= frames.get((check, Level.ALARM), set())
-    return {key: found for key, found in frames.items() if found}
+    return {key: rows for key, rows in frames.items() if rows}
 
 
 def bitmask(flags: Iterable[Flag]) -> int:
