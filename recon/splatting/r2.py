@@ -28,6 +28,7 @@ from recon.splatting.train import run_fit
 from recon.splatting.work import fit_costs
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
+from splatline.registry import unknown
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
@@ -79,7 +80,7 @@ class R2:
 
     def __post_init__(self) -> None:
         if self.start not in get_args(Start):
-            raise ValueError(f"start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
+            raise ValueError(unknown("start", self.start, get_args(Start)))
         if self.steps is not None and operator.index(self.steps) < 0:
             raise ValueError(f"steps must be 0 or more, got {self.steps}")
         if self.finish is not None and operator.index(self.finish) < 0:

@@ -25,6 +25,7 @@ from recon.voxels.fbp import Filter, fbp, fbp_memory, ramp
 from recon.voxels.fdk import fdk, refuse_climbing
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
+from splatline.registry import unknown
 
 _f = np.float32
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
@@ -147,7 +148,7 @@ class Fbp:
 
     def __post_init__(self) -> None:
         if self.filter not in get_args(Filter):
-            raise ValueError(f"filter must be one of {', '.join(get_args(Filter))}, got {self.filter!r}")
+            raise ValueError(unknown("filter", self.filter, get_args(Filter)))
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]
