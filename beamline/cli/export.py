@@ -22,7 +22,7 @@ from beamline.cli.options import (
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock

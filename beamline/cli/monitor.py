@@ -15,7 +15,7 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Done, FrameFlagged, Sink, Warned
 from beamline.core.files import refuse_existing, write_whole
-from beamline.core.signals import StopOnSignal
+from beamline.core.stop import StopOnSignal
 from beamline.core.text import spans
 from drivers.base.clock import Clock, SystemClock
 

@@ -32,8 +32,8 @@ from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
-from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal
 from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO

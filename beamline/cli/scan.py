@@ -16,8 +16,7 @@ from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Done, Sink
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind

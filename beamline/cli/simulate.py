@@ -18,15 +18,14 @@ from beamline.core.events import CostExplained, Done, Event, Sink
 from beamline.core.files import refuse_existing, remove, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
-from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
-    from beamline.simulate.emission import EmissionScene
     from beamline.simulate.scene_file import Scan, SceneFile
-    from beamline.simulate.write import SimulatedScan
+    from beamline.simulate.write import EmissionScene, SimulatedScan
 
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
 _VIEWS = click.IntRange(1)
@@ -216,8 +215,8 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
 def _emission(
     scene: EmissionScene, seed: int, out: Path | None, truth: Path | None, output: _Output, sink: Sink
 ) -> dict[str, object]:
-    from beamline.simulate.emission import emit, write_emission
     from beamline.simulate.truth import truth_of_emission, write_truth
+    from beamline.simulate.write import emit, write_emission
 
     wanted = {"output": out, "truth": truth}
     for path in (path for path in wanted.values() if path):

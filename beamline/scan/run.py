@@ -33,7 +33,7 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
-from beamline.plan.retake import Retake, spread
+from beamline.plan.angles import Retake, spread
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog, beam_log

@@ -116,7 +116,7 @@ class _Planning:
         judge = HeldOutTrial.of(problem)
         if judge is None:
             return x
-        weight = choose_weight(problem, x, modelled=False, trial=lambda: judge)
+        weight = choose_weight(problem, x, SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
         patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
@@ -244,7 +244,7 @@ class _Finish:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
-        weight, strength = choose_weight(problem, x, modelled=True, trial=trial), 0.0
+        weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
