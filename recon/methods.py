@@ -84,12 +84,12 @@ def names() -> tuple[str, ...]:
 
 def names_of_one_volume() -> tuple[str, ...]:
     """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
-    return tuple(name for name, entry in _entries().items() if not entry.several)
+    return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 
 def names_of_one_scan() -> tuple[str, ...]:
     """Names of the methods that take one scan; loads no module of ours."""
-    return tuple(name for name, entry in _entries().items() if entry.several != "materials")
+    return tuple(name for name, entry in METHODS.items() if entry.several != "materials")
 
 
 def names_compared(emission: bool = False) -> tuple[str, ...]:
