@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -159,8 +159,15 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
         as it should be.
     """
-    from beamline.reconstruct.follow import follow as follow_scan
-    from beamline.reconstruct.offline import reconstruct_file  # here: help needs none of it
+    reconstruct: Callable[..., Mapping[str, float]]
+    if values["follow"]:  # each loads what only it needs
+        from beamline.reconstruct.follow import follow
+
+        reconstruct = follow
+    else:
+        from beamline.reconstruct.offline import reconstruct_file
+
+        reconstruct = reconstruct_file
 
     last: list[Event] = []
     stop = StopOnSignal(ready=values["follow"] or options.budget is not None)
@@ -176,7 +183,6 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         with logged(values["log"], shown) as lines:
             sink = fan_out(last.append, made, *lines, shown)
             scope = EndsWithParent(stop, sys.stdin.fileno()) if values["beside"] else stop
-            reconstruct = follow_scan if values["follow"] else reconstruct_file
             metrics = reconstruct(options, sink, SystemClock(), stop_scope=scope)
     done, output = last[-1], options.target.output
     assert isinstance(done, VolumeDone)

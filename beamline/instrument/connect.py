@@ -45,9 +45,7 @@ from drivers.base.protocols import (
     TriggerSource,
     Watchable,
 )
-from drivers.beam_monitors.page import PageSource
-from drivers.beam_monitors.reading import TextBeamMonitor, TextSource
-from drivers.beam_monitors.serial import ElectrometerQuery, SerialSource
+from drivers.beam_monitors.reading import ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor, TextSource
 from drivers.epics.devices import PvShutter, PvSource
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter

@@ -14,7 +14,6 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
@@ -182,6 +181,8 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, volume: Volume, setting
     """
     grid = volume.grid
     if not is_coarse(views, grid):
+        import torch
+
         half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
         outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
         gaussians = gaussians.select(outside.any(dim=1))

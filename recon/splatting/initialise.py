@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
-from scipy.spatial import cKDTree
 
 from recon.base.binning import bin_views
 from recon.base.choices import Filter
@@ -310,6 +309,8 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
     near = min(4, means.shape[0])
     if near < 2:
         return np.full(near, np.inf)
+    from scipy.spatial import cKDTree
+
     distances = np.asarray(cKDTree(means).query(means, k=near)[0])
     return np.sqrt((distances[:, 1:] ** 2).mean(axis=1))
 

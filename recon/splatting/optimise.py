@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
@@ -162,6 +161,8 @@ def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: 
 
 def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussians:
     """A copy of the model."""
+    import torch
+
     device = backend or Cpu()
     means, log_scales, quaternions, raw = (
         torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES

@@ -8,87 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Literal
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
-from recon.kernels import reference
-from recon.splatting.backend import Backend, Cpu, Pass
+from recon.splatting.backend import Backend, Cpu
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 Implementation = Literal["auto", "cpu", "gpu", "reference"]
-
-
-class _On(NamedTuple):
-    """What raw parameters are of, and what computes them; `unit` is that of the densities."""
-
-    unit: float
-    kernel: Kernel
-    backend: Backend[Any]
-
-
-class Project(torch.autograd.Function):
-    """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: _On, geometry: Geometry,
-        how: tuple[float, float, RayModel],
-    ) -> Tensor:  # fmt: skip
-        """Images [view, row, col]; `how` is what is too faint, the truncation in standard deviations, and the rays."""
-        ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = on, geometry, how
-        run = _begin((means, log_scales, quaternions, raw), on)
-        images = means.new_empty((geometry.n_views, *geometry.detector_shape))
-        for view, image in enumerate(images):
-            image.copy_(torch.as_tensor(run.view(geometry, view, *how).image))
-        return images
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, geometry, how = ctx.given
-        run = _begin(ctx.saved_tensors, on)
-        for view, slope in enumerate(gradient):
-            run.view(geometry, view, *how).backward(_native(slope, on.backend))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
-
-
-class Voxelize(torch.autograd.Function):
-    """Voxels of raw parameters on a backend."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: _On, grid: Grid,
-        how: tuple[float, float],
-    ) -> Tensor:  # fmt: skip
-        """Density [z, y, x]; `how` is what is too faint, and the truncation in standard deviations."""
-        ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = on, grid, how
-        run = _begin((means, log_scales, quaternions, raw), on)
-        return torch.as_tensor(run.box(grid, *how).density)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, grid, how = ctx.given
-        run = _begin(ctx.saved_tensors, on)
-        run.box(grid, *how).backward(_native(gradient, on.backend))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
-
-
-def _begin(parameters: Sequence[Tensor], on: _On) -> Pass[Any]:
-    means, log_scales, quaternions, raw = (_native(tensor, on.backend) for tensor in parameters)
-    return on.backend.begin(means, log_scales, quaternions, raw, on.unit, on.kernel)
-
-
-def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
-    """The values as an array of the backend, without a copy where they are contiguous."""
-    values = tensor.detach().contiguous()
-    return values.numpy() if isinstance(backend, Cpu) else values
 
 
 def project(
@@ -109,6 +40,11 @@ def project(
         ValueError: the implementation does not support tensors of this type or on this device.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
+    import torch
+
+    from recon.kernels import reference
+    from recon.splatting.autograd import Project
+
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
     g, which = turned_by_rows(gaussians, chosen, -1), _chosen(gaussians, implementation)
@@ -133,6 +69,11 @@ def voxelize(
     gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, implementation: Implementation = "auto"
 ) -> Tensor:
     """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
+    import torch
+
+    from recon.kernels import reference
+    from recon.splatting.autograd import Voxelize
+
     g, which = gaussians, _chosen(gaussians, implementation)
     if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
@@ -143,13 +84,15 @@ def voxelize(
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
     """The first arguments of `Project` and `Voxelize`."""
+    from recon.splatting.autograd import On
+
     if implementation == "gpu":
         from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
 
         backend: Backend[Any] = Gpu(g.means.device)
     else:
         backend = Cpu()
-    return g.means, g.log_scales, g.quaternions, g.raw_densities, _On(g.density_unit, g.kernel, backend)
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, On(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
@@ -158,6 +101,8 @@ def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> 
 
 
 def _chosen(gaussians: Gaussians, implementation: Implementation) -> Implementation:
+    import torch
+
     dtype, device = gaussians.means.dtype, gaussians.means.device.type
     suited: Implementation = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
     chosen = suited if implementation == "auto" else implementation
