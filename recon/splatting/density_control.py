@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from splatline.registry import unknown
+from recon.base.settings_check import check_settings
 
 # Each half of a split moves this far from the centre, in standard deviations along the longest axis.
 _APART = 0.75
@@ -53,8 +53,7 @@ class DensityPolicy:
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
-        if self.rule not in get_args(Rule):
-            raise ValueError(unknown("rule", self.rule, get_args(Rule)))
+        check_settings(self, choices={"rule": get_args(Rule)})
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
@@ -25,7 +26,6 @@ from recon.voxels.fbp import Filter, fbp, fbp_memory, ramp
 from recon.voxels.fdk import fdk, refuse_climbing
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
-from splatline.registry import unknown
 
 _f = np.float32
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
@@ -147,8 +147,7 @@ class Fbp:
     filter: Filter = "hann"
 
     def __post_init__(self) -> None:
-        if self.filter not in get_args(Filter):
-            raise ValueError(unknown("filter", self.filter, get_args(Filter)))
+        check_settings(self, choices={"filter": get_args(Filter)})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]
