@@ -164,7 +164,7 @@ def _refitted(
             control.on_progress(
                 Progress(done, 2 * sweeps, seconds, math.nan, math.nan, 0, n, unit="sweeps of error bars")
             )
-        stopped = stopped or (control.should_stop is not None and control.should_stop())
+        stopped = stopped or control.stop()
         return stopped
 
     volumes: list[F32] = []

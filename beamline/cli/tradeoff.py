@@ -32,14 +32,14 @@ from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared, names_of_one_volume
+from splatline.registry import unknown
 
 
 def listed(value: str) -> tuple[str, ...]:
     """Names of methods, separated by commas. ValueError for another name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    unknown = [name for name in wanted if name not in names_of_one_volume()]
-    if unknown:
-        raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names_of_one_volume())}")
+    if others := [name for name in wanted if name not in names_of_one_volume()]:
+        raise ValueError(unknown("method", others[0], names_of_one_volume()))
     return wanted
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.config.tree import KeyPath, Tree
+from splatline.registry import nearest
 
 Schema = Mapping[str, Any]
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
@@ -108,8 +108,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
 
 
 def _nearest(word: Any, legal: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(word), legal, n=1, cutoff=0.65)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return f" (did you mean {near}?)" if (near := nearest(word, legal)) else ""
 
 
 def _value(data: Any, path: KeyPath) -> Any:

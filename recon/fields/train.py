@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
 from recon.fields.networks import Field
@@ -72,16 +72,12 @@ class FieldMethod(ABC):
     width: int = 32
 
     def __post_init__(self) -> None:
-        for name in ("steps", "rays", "width"):
-            if operator.index(getattr(self, name)) < 1:
-                raise ValueError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        for name in ("rate", "highest"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if self.samples is not None and operator.index(self.samples) < 2:
-            raise ValueError(f"samples must be 2 or more, got {self.samples}")
-        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
-            raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
+        check_settings(
+            self,
+            whole={"steps": 1, "rays": 1, "width": 1, "samples": 2},
+            least={"seconds": 0.0},
+            above={"rate": 0.0, "highest": 0.0},
+        )
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return fit_field(self, problem, control)
@@ -246,7 +242,7 @@ class _Fit:
             if now() - reported > 0.1:
                 reported = now()
                 self._report(len(used))
-            if self.control.should_stop is not None and self.control.should_stop():
+            if self.control.stop():
                 break
             if method.early_stop and self.looks - self.best.look > _PATIENCE:
                 break

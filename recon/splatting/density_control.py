@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
+from recon.base.settings_check import check_settings
 
 # Each half of a split moves this far from the centre, in standard deviations along the longest axis.
 _APART = 0.75
@@ -52,8 +53,7 @@ class DensityPolicy:
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
-        if self.rule not in get_args(Rule):
-            raise ValueError(f"rule must be one of {', '.join(get_args(Rule))}, got {self.rule!r}")
+        check_settings(self, choices={"rule": get_args(Rule)})
 
 
 @dataclass(frozen=True, eq=False)

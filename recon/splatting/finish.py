@@ -54,7 +54,7 @@ class _Watch:
         self._begin, self._trials, self.ended = control.now(), 0, False
 
     def asked(self) -> bool:
-        self.ended = self._control.should_stop is not None and self._control.should_stop()
+        self.ended = self._control.stop()
         return self.ended
 
     def trial(self) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from recon.base.choices import KERNEL
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
@@ -73,19 +74,12 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
-        for name in ("views_per_step", "joined_pixels", "tv_size"):
-            value = getattr(self, name)
-            if value is None and name != "views_per_step":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
-        for name in ("ssim_weight", "tv_weight"):
-            weight = getattr(self, name)
-            if weight is not None and not 0 <= weight < math.inf:
-                raise ValueError(f"{name} must be finite and 0 or more, got {getattr(self, name)}")
-        for name in ("pace", "decay", "smallest"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+        check_settings(
+            self,
+            whole=dict.fromkeys(("views_per_step", "joined_pixels", "tv_size"), 1),
+            least=dict.fromkeys(("ssim_weight", "tv_weight"), 0.0),
+            above=dict.fromkeys(("pace", "decay", "smallest"), 0.0),
+        )
         if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
             raise ValueError(
                 f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"

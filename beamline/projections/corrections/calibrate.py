@@ -12,6 +12,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.projections.selection import geometry_of, pivot_of, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
+from splatline.registry import unknown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,9 +40,8 @@ def _terms(text: str) -> tuple[str, ...]:
     if names == ["none"]:
         return ()
     every = *GEOMETRY, *OF_VIEWS
-    unknown = [name for name in names if name not in every]
-    if unknown:
-        raise ValueError(f"{', '.join(unknown)!r} is not known; choose from {', '.join(every)}")
+    if others := [name for name in names if name not in every]:
+        raise ValueError(unknown("term", others[0], every))
     return tuple(name for name in every if name in names)
 
 

@@ -113,5 +113,5 @@ def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Pa
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
     with pytest.raises(ConfigError, match=r"--calibrate learns what .* states: give one of"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
-    with pytest.raises(ValueError, match="'lean' is not known; choose from axis, roll, tilt, shifts"):
+    with pytest.raises(ValueError, match="term 'lean' is unknown; legal: axis, roll, tilt, shifts"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")
