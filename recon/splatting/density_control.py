@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 
-# Each half of a split moves this far from the centre, in standard deviations along the longest axis.
+# Each half of a split or clone moves this far from the centre, in standard deviations along the longest axis.
 _APART = 0.75
 
 # Standard deviations (of the longest axis) outside the box beyond which a Gaussian is removed. The tail of a nearer one
@@ -133,7 +133,7 @@ def _halves(
     """Splits and clones Gaussians by the rule "mass".
 
     Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
-    Cloning: two of half the density, a small distance apart, since equal ones would always get equal gradients.
+    Cloning: two of half the density, as far apart, since equal ones would always get equal gradients.
 
     Returns:
         Shifts of the first and second halves [n, 3] mm, what is added to their log scales [n, 3], and what their
@@ -141,7 +141,7 @@ def _halves(
     """
     at, axis = np.arange(split.size), log_scales.argmax(axis=1)
     sign = np.where(rng.random(split.size) < 0.5, 1, -1)
-    apart = np.where(split, _APART, 0.25) * np.exp(log_scales[at, axis]) * sign
+    apart = _APART * np.exp(log_scales[at, axis]) * sign
     shrink = np.where(split, np.sqrt(1 - _APART**2), 1.0)
     offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)

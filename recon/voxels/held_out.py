@@ -43,7 +43,6 @@ _COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges o
 _ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
 _AIR = 0.03  # of the largest line integral: columns below see air
 _BESIDE = 0.05  # of the width of the matter: air that trials see on either side
-_NARROWER = 0.9  # of the columns: wider matter is not worth a cut
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 
 
@@ -98,7 +97,7 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
 def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
     """The columns of `images` [view, row, col] that see matter, with some air beside it, and the box that holds it.
 
-    None: they are nearly all columns, or rows do not show slices around the detector's middle.
+    None: they are all columns, or rows do not show slices around the detector's middle.
     """
     if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
         return None
@@ -109,7 +108,7 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
         return None
     half = (1 + 2 * _BESIDE) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
     first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
-    if stop - first > _NARROWER * width:
+    if stop - first == width:
         return None
     views = replace(
         geometry, detector_shape=(geometry.detector_shape[0], stop - first), axis_col=geometry.axis_col - first

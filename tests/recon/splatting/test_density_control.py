@@ -139,5 +139,5 @@ def test_clones_do_not_coincide(random_gaussians: Make) -> None:
     g = random_gaussians(1)
     change = _control(g, np.ones(1), DensityPolicy(large=1e6))
     apart = np.linalg.norm(change.means[0] - change.means[1])
-    assert apart == pytest.approx(0.5 * float(g.scales.max()), rel=1e-4)
+    assert apart == pytest.approx(1.5 * float(g.scales.max()), rel=1e-4)
     assert math.isclose(*np.logaddexp(0, change.raw), rel_tol=1e-6)
