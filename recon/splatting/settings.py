@@ -15,8 +15,8 @@ from recon.splatting.problem import FitProblem, Loss
 NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 
 # Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
-# Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
-_TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
+# Factor and bound from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
+_TV_OF_NOISE, _TV_MOST = 3e5, 0.25
 # Matter that changes more from voxel to voxel needs less of it: as for a prior of Laplace, noise counts by that change.
 # On a thorax, a walnut and a battery it is 0.09 to 0.17 of the density unit, on a thin-walled teapot 0.33.
 _TV_CHANGE = 0.16
@@ -34,7 +34,7 @@ class FitSettings:
         ssim_weight: of 1 - SSIM beside it.
         tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
             times the density unit). That is divided by the pixels of a Gaussian. Where matter changes by more than 0.16
-            of the density unit a voxel, it falls with the square of this change. It is kept between 0.02 and 0.25.
+            of the density unit a voxel, it falls with the square of this change. It is 0.25 at most.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
         tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
@@ -42,8 +42,7 @@ class FitSettings:
             dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
-            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
-            higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
+            26 times as fast, with two views a step, gains 1 to 4 dB there (see docs/notes/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.
@@ -62,10 +61,10 @@ class FitSettings:
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
     pace: float = 26.0
-    decay: float = 0.08
+    decay: float = 0.1
     policy: DensityPolicy | None = field(default_factory=DensityPolicy)
     truncation: Truncation = field(default_factory=Truncation)
-    smallest: float = 0.3
+    smallest: float = 0.128
     views_per_step: int = 2
     joined_pixels: int | None = None
     rays: RayModel = field(default_factory=RayModel)
@@ -99,7 +98,7 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
     sharp = max(problem.change / _TV_CHANGE, 1.0)
-    return min(max(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, _TV_RANGE[0]), _TV_RANGE[1])
+    return min(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, _TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
