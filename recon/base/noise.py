@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
-from scipy.signal import find_peaks
 
 from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
@@ -155,6 +153,8 @@ def _fine(image: F32) -> F32:
 
 def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
     """Values [..., col] of the columns on the other side of the axis, by cubic splines; NaN where there are none."""
+    from scipy.interpolate import make_interp_spline  # half a second
+
     cols = values.shape[-1]
     at = 2 * axis_col - np.arange(cols)
     spline = make_interp_spline(np.arange(cols), values, 3, axis=-1)
@@ -193,8 +193,8 @@ def air_level(values: F32) -> tuple[float, float]:
     counts, edges = np.histogram(values, _BINS, (low, high))
     smooth = np.concatenate(([0], gaussian_filter(counts.astype(np.float64), 2), [0]))
     least = _PEAK * smooth.max()
-    peaks, _ = find_peaks(smooth, height=least, prominence=least / 2)
-    level = float(edges[peaks[0] - 1] + edges[peaks[0]]) / 2
+    first_peak = _first_peak(smooth, least, least / 2)
+    level = float(edges[first_peak - 1] + edges[first_peak]) / 2
     below = level - values[values < level]
     first = noise = median_deviation(below)
     for _ in range(_ROUNDS):
@@ -204,6 +204,25 @@ def air_level(values: F32) -> tuple[float, float]:
         level = float(np.median(near))
         noise = min(median_deviation(near - level), _GROWTH * first)
     return level, noise
+
+
+def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) -> int:
+    """Index of the first maximum of this height and prominence; the middle of a level one, as scipy's `find_peaks`.
+
+    A curve that begins and ends at its minimum has one. scipy.signal takes a second to load.
+    """
+    bounds = np.flatnonzero(np.diff(curve, prepend=np.nan, append=np.nan))  # of stretches of one value
+    for first, last in zip(bounds[:-1], bounds[1:] - 1, strict=True):
+        top = curve[first]
+        if top < height or first == 0 or last == curve.size - 1 or max(curve[first - 1], curve[last + 1]) > top:
+            continue
+        before, after = curve[:first][::-1], curve[last + 1 :]
+        valleys = [
+            side[: np.argmax(higher) if (higher := side > top).any() else None].min() for side in (before, after)
+        ]
+        if top - max(valleys) >= prominence:
+            return int(first + last) // 2
+    raise ValueError("the curve has no such peak")
 
 
 def _long_axes(images: F32) -> list[int]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from recon.base.arrays import F64
 from recon.prep.align import opposite_curves
 from recon.prep.axis_search import FEWEST_COLS
 from recon.prep.axis_wedge import wedge_curves
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 STEEPEST = math.radians(5)  # Largest tilt of the search, radians
 FEWEST_BANDS = 4
@@ -98,6 +101,8 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     typical = float(np.median(np.log(curves).sum(axis=0)))
     if abs(slope) == most or not 0 < at < n - 1 or typical - lowest < _DEEP * heights.size:
         raise ValueError("no clear optimum")
+    from scipy.interpolate import CubicSpline  # half a second
+
     splines = [CubicSpline(candidates, curve) for curve in curves]
     start = np.array([candidates[at], slope * step / far])
     every = np.arange(heights.size)

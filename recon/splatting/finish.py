@@ -14,7 +14,6 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
@@ -27,7 +26,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
-from recon.voxels.iterative import prior_decisions, solve
+from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods.pnp_dct import TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
@@ -182,6 +181,8 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, volume: Volume, setting
     """
     grid = volume.grid
     if not is_coarse(views, grid):
+        import torch
+
         half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
         outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
         gaussians = gaussians.select(outside.any(dim=1))
@@ -227,7 +228,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     watch, decide = _Watch(control, problem.geometry.n_views), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
-    solve(method, projector, data, weight=weights, on_trial=watch.trial, decide=decide)
+    solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
     if watch.ended or "strength" not in decide.made:
         return Candidates()
     tried = method.tried
@@ -302,7 +303,7 @@ def finish(
     watch, count = _Watch(control, problem.geometry.n_views), SWEEPS if sweeps is None else sweeps
     refined = solve(
         _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
-        on_iteration=lambda sweep, _: watch.sweep(sweep, max(sweep, count)), on_trial=watch.trial, decide=decide,
+        watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)
 
