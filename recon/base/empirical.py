@@ -56,8 +56,8 @@ FIRST_THRESHOLD = 8.0
 """Times the noise of a volume. Without: -0.4 dB of `pnp-dct` on 12 views, which prefer nothing; -0.3 on bone."""
 
 PULL = 0.03
-"""Of the largest eigenvalue of AᵀWA, towards sparse patches. Without, at ten times: -1.3 dB on bone; at a tenth: -1.2 dB
-on cement."""
+"""Of the largest eigenvalue of AᵀWA, towards sparse patches. Without, at ten times: -1.3 dB on bone; at a tenth:
+-1.2 dB on cement."""
 
 FALL = 0.8
 """Of the threshold, from round to round. Without: -0.3, -0.8 dB on bone and cement."""
@@ -128,7 +128,7 @@ START_SWEEPS = 10
 
 # How is a fit made?
 
-STEPS = 400
+DEFAULT_STEPS = 400
 """Of a fit before its finish. Without: a shell has 34.9 dB after 100, 41.3 after 400."""
 
 MODEL_STEPS = 50
@@ -140,9 +140,15 @@ PACE = 26.0
 VIEWS_A_STEP = 2
 """Averaged in a gradient. Without: -1.7 dB on a teapot, -1.3 and -0.8 dB on a shell and bone of 12 views."""
 
+NARROWEST = 0.3
+"""Pixels of a Gaussian's least standard deviation. Without, at the published 0.128: -0.6 dB on a shell in a cone."""
+
 TV_OF_NOISE = 3e5
 """Weight of total variation over the variance of a pixel's noise, and times a Gaussian's pixels. Without, at the
 published weight: -2.2, -0.8 dB on cement and bone of 12 views, -0.5 dB on a teapot in a cone."""
+
+TV_LEAST = 0.02
+"""The weight, at least. Without: -0.7 dB on a shell in a cone."""
 
 TV_MOST = 0.25
 """The weight, at most. Without: -1.1 dB on a foam of 12 views."""

@@ -10,13 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-
-# Each half of a split moves this far from the centre, in standard deviations along the longest axis.
-_APART = 0.75
-
-# Standard deviations (of the longest axis) outside the box beyond which a Gaussian is removed. The tail of a nearer one
-# is part of the views: without it, matter at the border is lost (0.05 to 0.16 dB, measured).
-_LOST = 3.0
+from recon.base.empirical import APART, GROWTH, LOST
 
 _PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 
@@ -49,7 +43,7 @@ class DensityPolicy:
     threshold: float = 5e-5
     large: float = 0.1
     prune_below: float = 1e-5
-    growth: float = 1.5
+    growth: float = GROWTH
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
@@ -100,7 +94,7 @@ def control(
     """
     means, log_scales, rotations, raw = model
     density = np.logaddexp(0, raw)
-    lost = _LOST if policy.rule == "mass" else 0.0
+    lost = LOST if policy.rule == "mass" else 0.0
     reach = lost * np.exp(log_scales.max(axis=1, keepdims=True))
     alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
     wanted = np.flatnonzero(alive & (statistic > policy.threshold))
@@ -139,7 +133,7 @@ def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
         density is divided by.
     """
     at, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
-    apart, shrink = _APART * np.exp(log_scales[at, axis]), math.sqrt(1 - _APART**2)
+    apart, shrink = APART * np.exp(log_scales[at, axis]), math.sqrt(1 - APART**2)
     offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
     narrower[at, axis] = math.log(shrink)

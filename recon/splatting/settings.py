@@ -6,6 +6,17 @@ import math
 from dataclasses import dataclass, field
 
 from recon.base.choices import KERNEL
+from recon.base.empirical import (
+    NARROWEST,
+    PACE,
+    TV_CHANGE,
+    TV_LEAST,
+    TV_MOST,
+    TV_OF_NOISE,
+    TV_SHARE,
+    TV_WIDEST,
+    VIEWS_A_STEP,
+)
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
@@ -14,15 +25,7 @@ from recon.splatting.problem import FitProblem, Loss
 
 NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 
-# Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
-# Factor and bound from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
-_TV_OF_NOISE, _TV_MOST = 3e5, 0.25
-# Matter that changes more from voxel to voxel needs less of it: as for a prior of Laplace, noise counts by that change.
-# On a thorax, a walnut and a battery it is 0.09 to 0.17 of the density unit, on a thin-walled teapot 0.33.
-_TV_CHANGE = 0.16
-# A box of a 64th of the grid: in a smaller one, a place would see total variation in rare kicks. Adam's moments take
-# these for steepness, which slows everything down (-1.8 dB on a battery of 256³ voxels).
-_TV_SHARE, _TV_SIZES = 4, (32, 96)
+TV_LEAST_SIDE = 32  # voxels of the box of total variation (Zha et al. 2024)
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class FitSettings:
         ssim_weight: of 1 - SSIM beside it.
         tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
             times the density unit). That is divided by the pixels of a Gaussian. Where matter changes by more than 0.16
-            of the density unit a voxel, it falls with the square of this change. It is 0.25 at most.
+            of the density unit a voxel, it falls with the square of this change. It is kept between 0.02 and 0.25.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
         tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
@@ -60,12 +63,12 @@ class FitSettings:
     tv_size: int | None = None
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
-    pace: float = 26.0
+    pace: float = PACE
     decay: float = 0.1
     policy: DensityPolicy | None = field(default_factory=DensityPolicy)
     truncation: Truncation = field(default_factory=Truncation)
-    smallest: float = 0.128
-    views_per_step: int = 2
+    smallest: float = NARROWEST
+    views_per_step: int = VIEWS_A_STEP
     joined_pixels: int | None = None
     rays: RayModel = field(default_factory=RayModel)
     kernel: Kernel = KERNEL
@@ -97,16 +100,16 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
         return settings.tv_weight
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
-    sharp = max(problem.change / _TV_CHANGE, 1.0)
-    return min(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, _TV_MOST)
+    sharp = max(problem.change / TV_CHANGE, 1.0)
+    return min(max(TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, TV_LEAST), TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
     """Voxels per side of the box of total variation: as set, or by the size of the grid."""
     if settings.tv_size is not None:
         return settings.tv_size
-    side = round(math.prod(grid.shape) ** (1 / 3) / _TV_SHARE / 16) * 16  # whole lanes of the kernels
-    return min(max(side, _TV_SIZES[0]), _TV_SIZES[1])
+    side = round(math.prod(grid.shape) ** (1 / 3) / TV_SHARE / 16) * 16  # whole lanes of the kernels
+    return min(max(side, TV_LEAST_SIDE), TV_WIDEST)
 
 
 def growth(settings: FitSettings) -> float:

@@ -9,6 +9,7 @@ from functools import cache, partial
 from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
+from recon.base.empirical import FIRST_THRESHOLD, TRIAL_STEPS, TRIAL_SWEEPS, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
@@ -16,7 +17,6 @@ from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
-    TRIAL_SWEEPS,
     TRIALS,
     HeldOutTrial,
     alike_of,
@@ -26,13 +26,9 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
+from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import patch_choice, patch_steps
-
-_FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
-TRIAL_THRESHOLD = 1.6
-"""Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +132,7 @@ def choose_patches(
 
     def chosen() -> list[float]:
         judge = None if isinstance(weight, NoiseBalance) else trial()
-        first = _FIRST * noise_of_volume(problem if judge is None else judge.problem)
+        first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
         if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
         smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
