@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.base.choices import DEFAULT_STEPS, Quality
+from recon.base.choices import Quality
+from recon.base.empirical import DEFAULT_STEPS
 
 _MOST_BINNED = 2  # of the measured curves
 
