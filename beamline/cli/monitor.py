@@ -67,10 +67,8 @@ def monitor(
     from beamline.config.monitor import configured_checks, reference_limits
     from beamline.monitor.checks import CHECKS
     from beamline.projections.flagged_frames import worst_frames
-    from beamline.projections.rendered import rendered
     from beamline.projections.replay import replay, verdict
     from beamline.projections.returned import returned_views
-    from beamline.report.contact_sheet import contact_sheet
     from beamline.storage.flag_legend import FrameFlags, counted
     from beamline.storage.readers.open import SourceOptions
     from beamline.storage.rules.validate import scan_ended
@@ -89,7 +87,11 @@ def monitor(
         frames: list[Judged] = []
         active: set[tuple[str, Level]] = set()
         with SourceOptions(file, **scan_facts).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
-            model = None if volume is None else rendered(volume, source)
+            model = None
+            if volume is not None:
+                from beamline.projections.rendered import rendered  # loads numba
+
+                model = rendered(volume, source)
             for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
                 frames.append(judged)
                 if not follow:
@@ -103,6 +105,8 @@ def monitor(
             returned = [] if stopped() else returned_views(source)
             ended = [finding.message for finding in scan_ended(source)]
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in frames]))):
+                from beamline.report.contact_sheet import contact_sheet
+
                 write_whole(sheet, contact_sheet(worst))
         altered = [summed.altered] if summed.altered else []
         for fault in [*summed.references, *altered, *ended]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,11 +163,15 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
         as it should be.
     """
+    reconstruct: Callable[..., dict[str, float]]
     if values["follow"]:  # each loads what only it needs
-        from beamline.reconstruct.follow import follow as reconstruct
-    else:
-        from beamline.reconstruct.offline import reconstruct_file as reconstruct
+        from beamline.reconstruct.follow import follow
 
+        reconstruct = follow
+    else:
+        from beamline.reconstruct.offline import reconstruct_file
+
+        reconstruct = reconstruct_file
     last: list[Event] = []
     stop = StopOnSignal(ready=values["follow"] or options.budget is not None)
 

@@ -221,7 +221,9 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
         if top < height or first == 0 or last == curve.size - 1 or max(curve[first - 1], curve[last + 1]) > top:
             continue
         before, after = curve[:first][::-1], curve[last + 1 :]
-        valleys = [side[: np.argmax(higher) if (higher := side > top).any() else None].min() for side in (before, after)]
+        valleys = [
+            side[: np.argmax(higher) if (higher := side > top).any() else None].min() for side in (before, after)
+        ]
         if top - max(valleys) >= prominence:
             return int(first + last) // 2
     raise ValueError("the curve has no such peak")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu
