@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
@@ -238,6 +237,8 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
 
 def histograms(statistics: list[KindStatistics]) -> bytes:
     """Pixels against their values, a curve a kind, as PNG; at most 400 bins each."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     for each in statistics:

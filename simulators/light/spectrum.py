@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
 
 from simulators.light.beam import Beam, Tube
 
@@ -169,6 +168,8 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     Returns:
         All energies where fewer do not suffice, or are not found.
     """
+    from scipy.optimize import nnls  # half a second
+
     n_materials = attenuation.shape[1]
     ways = [np.eye(n_materials)]
     for pair in combinations(range(n_materials), 2):
