@@ -67,9 +67,11 @@ def prepare_energies(
     middles: list[float] = []
     phases = phases or Phases()
     attenuation, axis_col = [], None
-    for each in scans.scans:
+    for each in scans.scans:  # before any is corrected
         with each.open() as scan:
             attenuation.append(_attenuation(scans, scan, selection))
+    for each in scans.scans:
+        with each.open() as scan:
             chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)
             parts.append(prepare_projections(scan, chosen, warn, check=check, phases=phases))
             middles.append(((scan.shape[0] - 1) / 2 - rows_of(scan, chosen).start + 0.5) / chosen.binning - 0.5)

@@ -14,7 +14,6 @@ import recon
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
@@ -37,6 +36,7 @@ from recon.base.method import (
     candidates_of,
 )
 from recon.base.slabs import Slab
+from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
@@ -51,7 +51,7 @@ class Job:
     prepared: PreparedProjections
     sink: Sink
     clock: Clock
-    stop_latch: StopLatch
+    stop: Stop
     warn: Warnings
     region: RegionOfRows | None = None
 
@@ -112,7 +112,7 @@ class Job:
         # Rays that weigh nothing were filled on disk, as a direct method does it.
         filled = method.traits.direct and prepared.on_disk
         weights = None if filled else prepared.ray_weights(len(held_out))
-        control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
+        control = replace(control, should_stop=self.stop, now=self.clock.now)
         with self.refused(f" by {method.name}"):
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
@@ -159,7 +159,7 @@ def with_error_bars(job: Job, made: Reconstruction, slabs: Sequence[Slab], decid
     message = "The volume is there; its error bars follow. Ctrl-C leaves them out."
     job.sink(StateEntered("error_bars", message, time=job.clock.now()))
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
-    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
+    control = RunControl(job.stop, job.listener(), now=job.clock.now)
     given = made.volume, method, job.prepared, job.options
 
     why = "as they were stopped"
@@ -215,7 +215,7 @@ def _at_once(job: Job, decided: Decisions) -> tuple[Reconstruction, str]:
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
     finishes = method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
-    early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
+    early = job.stop.stopped if finishes else job.stop.cut(reached, planned)
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return _recorded(result, early, resumed | ({"checkpoint_lost": lost} if lost else {})), chosen
 
@@ -223,14 +223,14 @@ def _at_once(job: Job, decided: Decisions) -> tuple[Reconstruction, str]:
 def _by_slabs(job: Job, slabs: Sequence[Slab], decided: Decisions) -> tuple[Reconstruction, str]:
     """Run a method slab by slab. Then what was chosen."""
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
-    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now, decide=decided)
+    control = RunControl(job.stop, job.listener(), now=job.clock.now, decide=decided)
 
     with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
         workers = None
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
         result = in_slabs(job.run_on, job.prepared, options, slabs, control, job.say, job.warn, workers)
-    return _recorded(result, job.stop_latch.stopped), _chosen(result)
+    return _recorded(result, job.stop.stopped), _chosen(result)
 
 
 def _chosen(result: Reconstruction) -> str:
@@ -242,8 +242,8 @@ def _chosen(result: Reconstruction) -> str:
 def _within_budget(job: Job, budget: float) -> MadeVolume:
     """Reconstruct within `budget` s, from pixels that may be joined."""
     methods, largest = candidates_of(job.options.method), None if job.region is None else 1
-    control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
+    control = RunControl(job.stop, job.listener(budget), now=job.clock.now)
     with job.refused():
         done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
-    made = _recorded(replace(done.result, seconds=done.seconds), job.stop_latch.stopped, done.settings(budget))
+    made = _recorded(replace(done.result, seconds=done.seconds), job.stop.stopped, done.settings(budget))
     return MadeVolume(made, done.summary(budget), done.prepared, done.choice.binning)

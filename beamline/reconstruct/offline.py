@@ -12,17 +12,19 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch, StopScope, never_stopped
+from beamline.core.stop import StopScope, never_stopped
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.cluster import refuse_unusable
 from beamline.reconstruct.energy_scans import EnergyScans
 from beamline.reconstruct.error_bars import refuse_impossible, refuse_views
-from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
+from beamline.reconstruct.in_time import fit_within, warnings_told
 from beamline.reconstruct.job import Job, volume_of, with_error_bars
 from beamline.reconstruct.measure import fit_truth, read_truth
+from beamline.reconstruct.option_rules import OF_ONE_VOLUME
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import corrections_done
 from beamline.reconstruct.region import locate
 from beamline.reconstruct.remarks import partly_seen_warning
@@ -40,8 +42,8 @@ from recon.base.method import (
     volumes_of,
 )
 from recon.base.slabs import Slab
+from recon.base.stop import Stop
 from recon.base.volume import Grid
-from recon.methods import with_trait
 from recon.splatting.backend import backend_for
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
@@ -77,28 +79,28 @@ def reconstruct_file(
     region = None if options.region is None else locate(options.region, options.selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
         phases.enter("compiling kernels")
-        job = Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region)
+        job = Job(options, prepared, sink, clock, Stop(), warn, region)
         job.compile_kernels()
         phases.enter("reconstruction")
-        deadline = Deadline()
+        before_report = Stop()
         if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
-            method, deadline = fit_within(options.method, prepared, options.target, (started, worked), clock, warn)
+            method, before_report = fit_within(options.method, prepared, options.target, (started, worked), clock, warn)
             job = replace(job, options=replace(options, method=method))
         # A direct method and a slab have no volume so far: a signal interrupts them.
         stopping = never_stopped if job.options.method.traits.direct or slabs else stop_scope
         decided = Decisions(options.seed)
         with stopping() as stopped, warnings_told(warn):
-            done = volume_of(replace(job, stop_latch=StopLatch(stopped)), slabs, decided)
+            done = volume_of(replace(job, stop=Stop(stopped)), slabs, decided)
         if options.uncertainty:
             phases.enter("error bars")
             with stop_scope() as stopped, warnings_told(warn):
-                job = replace(job, stop_latch=StopLatch(stopped))
+                job = replace(job, stop=Stop(stopped))
                 done = replace(done, made=with_error_bars(job, done.made, slabs, decided))
         selection = replace(options.selection, binning=options.selection.binning * done.factor)
         truth = None if truth_given is None else fit_truth(truth_given, done.made.volume.grid, selection.binning)
         context = ReportContext(
             facts, selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
-            region=region, phases=phases, leaves=deadline.leaves, filter=options.filter, chosen=done.chosen,
+            region=region, phases=phases, leaves=before_report.leaves, filter=options.filter, chosen=done.chosen,
         )  # fmt: skip
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         with stopping():  # the volume is there: the first signal no longer discards it
@@ -114,7 +116,10 @@ def _refuse_impossible(options: ReconOptions) -> None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
-    _refuse_foreign(options)
+    options.refuse_contradictions()
+    _refuse_for_source(options)
+    if options.method.traits.several:
+        _require_hdf5(options.target)
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
@@ -168,7 +173,7 @@ def require_finished(source: ScanSource, options: ReconOptions) -> None:
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Report the requested corrections of the views, then send the event `recon_started`."""
-    corrections_done({name: done.said for name, done in prepared.done.items() if not done.warned}, sink, clock)
+    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
     more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(
@@ -186,30 +191,14 @@ def check_device(device: str) -> None:
         raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
 
 
-def _refuse_foreign(options: ReconOptions) -> None:
-    """Raises ConfigError for options that the method would silently ignore."""
-    _refuse_for_source(options)
-    if options.method.traits.several:
-        _refuse_for_several(options)
-    given = {
-        "a quality preset": (options.quality is not None, "presets"),
-        "a time budget": (options.budget is not None, "budget"),
-        "checkpoints": (options.checkpoints.wanted, "checkpoints"),
-    }
-    for what, (asked, trait) in given.items():
-        if asked and not getattr(options.method.traits, trait):
-            owners = ", ".join(with_trait(trait))
-            raise ConfigError(
-                f"{options.method.name} does not take {what} (of {owners}): leave that out, or choose another method."
-            )
-
-
 def _refuse_for_source(options: ReconOptions) -> None:
     """Raises ConfigError for a method of other scans than the source has, or of other materials than its spectra."""
     method, scans = options.method, options.source if isinstance(options.source, EnergyScans) else None
     if method.traits.by_energy != (scans is not None):
         wanted = "scans at several energies, and spectra of the materials" if scans is None else "one scan"
         raise ConfigError(f"{method.name} takes {wanted}. Choose another method. Nothing was read.")
+    for name in (name for name in OF_ONE_VOLUME if scans is not None and name in options.given):
+        raise ConfigError(f"--{name} does not go with several energies: {OF_ONE_VOLUME[name]}. Nothing was computed.")
     if scans is not None and volume_names_of(method) != scans.spectra.names:
         raise ConfigError(
             f"{method.name} is of {', '.join(volume_names_of(method))}, {scans.spectra.path} of "
@@ -217,13 +206,7 @@ def _refuse_for_source(options: ReconOptions) -> None:
         )
 
 
-def _refuse_for_several(options: ReconOptions) -> None:
-    """Raises ConfigError for what is of one volume alone."""
-    several = "Volumes in time" if options.method.traits.in_time else "Volumes of materials"
-    of_one = {"a box of voxels": options.region, "a truth": options.truth, "a cluster": options.cluster}
-    for what, given in of_one.items():
-        if given is not None:
-            raise ConfigError(f"{several} do not go with {what}: leave that out. Nothing was read.")
-    output = options.target.output
-    if options.target.written and output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"-o {output}: {several.lower()} go into HDF5 files; give a name that ends in .h5.")
+def _require_hdf5(target: OutputPaths) -> None:
+    """Raises ConfigError for a file that holds one volume."""
+    if target.written and target.output.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"-o {target.output}: several volumes go into HDF5 files; give a name that ends in .h5.")

@@ -21,9 +21,13 @@ from beamline.core.events import Sink
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.energy_scans import read_spectra
+from beamline.reconstruct.offline import reconstruct_file
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.region import Region
 from beamline.storage.volumes.files import opened_volume
-from drivers.base.clock import Clock
+from drivers.base.clock import Clock, SystemClock
 from recon import spectral
 from recon.base.method import Progress
 from recon.base.ray_width import RayWidth
@@ -139,6 +143,10 @@ def test_a_script_gets_the_volumes_that_the_command_writes(scans: list[Path], ma
     ):
         with pytest.raises(api.ConfigError, match=said):
             api.reconstruct(given, method, say=None)
+    target, method = OutputPaths(tmp_path / "box.h5", None), recon.EnergySeries(held.series.names)
+    boxed = ReconOptions(source, target, wanted, method, region=Region((0, 1), (0, 9), (0, 9)))
+    with pytest.raises(api.ConfigError, match="--roi does not go with several energies: a box is of one volume"):
+        reconstruct_file(boxed, lambda event: None, SystemClock())
 
 
 def test_states_of_one_material_keep_their_sum(scans: list[Path], made: Path, tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def test_a_fit_that_is_interrupted_before_its_first_step_ends_at_once_and_leaves
 
 
 def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = offline.progress_events
+    told = job.progress_events
 
     def watched(*arguments: Any) -> Callable[[Progress], None]:
         listen = told(*arguments)
