@@ -149,29 +149,16 @@ def fit_series(
     refuse_few(knots, n)
     warn_of_other_quantity(views.projections)
     times = np.linspace(*views.span, knots)
-    near = (hats(views.times, times) > 0.5).sum(0)
-    if near.min() < _LEAST_NEAR:
-        k = int(near.argmin())
-        raise ValueError(
-            f"volume {k + 1} of {knots}, at time {times[k]:g}, has {near[k]} views within {np.diff(times)[0] / 2:g}, "
-            f"expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views before and after a gap apart"
-        )
+    _refuse_gaps(views.times, times)
     energies, past = of_moments(views, times, MOMENTS * (knots - 1))
     grid = Grid.matching(views.geometry)
     if tv_weight is None:
         weights = weights_by_views(energies, grid, seed, go_on, stop, alike=True)
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
-    learnt, left = None, None
     few, few_past = of_moments(views, times, _MOTION_MOMENTS)
     coarse = OfMoments(few, few_past, weights * math.sqrt(past.size / few_past.size))
-    if motion is None:
-        squares = unseen_squares(coarse, OfMoments(energies, past, weights), go_on, stop)
-        motion = squares is not None and _moves(*squares)
-        left = None if squares is None else (math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean()))
-    if motion:
-        learnt = learnt_motion(coarse, go_on, stop)
-        learnt = learnt and learnt.on(learnt.shape, past)
+    learnt, unseen = _motion(coarse, OfMoments(energies, past, weights), motion, go_on, stop)
     smooth = None if learnt is not None else _smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
     going = True
@@ -182,21 +169,53 @@ def fit_series(
         return going
 
     volumes, residual = fitted(fit, weights, sweeps, heard)
-    if smooth is None or not going or stop():
-        return TimedVolumes(times, volumes, grid, residual, learnt, left)
-    problem = _of_factors(energies, volumes, grid, stop)
-    steps = Countdown(lambda after: go_on(-after, residual), SOLUTION_STEPS)
-    factors = problem.solved(smooth, problem.ones(), steps)
-    if not steps.going or stop():
-        return TimedVolumes(times, volumes, grid, residual, learnt, left)
-    fit.stop = lambda: False
-    changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
-    return TimedVolumes(times, changed, grid, fit.residual_of(changed), learnt, left, smooth)
+    made = TimedVolumes(times, volumes, grid, residual, learnt, unseen)
+    return made if smooth is None or not going or stop() else _as_factors(made, fit, smooth, go_on)
+
+
+def _refuse_gaps(times: F64, knots: F64) -> None:
+    """ValueError where too few views are near one of the volumes."""
+    near = (hats(times, knots) > 0.5).sum(0)
+    if near.min() < _LEAST_NEAR:
+        k = int(near.argmin())
+        raise ValueError(
+            f"volume {k + 1} of {knots.size}, at time {knots[k]:g}, has {near[k]} views within "
+            f"{np.diff(knots)[0] / 2:g}, expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views "
+            "before and after a gap apart"
+        )
+
+
+def _motion(
+    coarse: OfMoments,
+    fine: OfMoments,
+    wanted: bool | None,
+    go_on: Callable[[int, float], bool],
+    stop: Callable[[], bool],
+) -> tuple[Motion | None, tuple[float, float] | None]:
+    """How the sample moves, and what volumes without and with motion leave of views held out, where these chose."""
+    unseen = None
+    if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
+        wanted = _moves(*squares)
+        unseen = math.sqrt(squares[0].mean()), math.sqrt(squares[1].mean())
+    learnt = learnt_motion(coarse, go_on, stop) if wanted else None
+    return learnt and learnt.on(learnt.shape, fine.times), unseen
 
 
 def _moves(still: F64, moved: F64) -> bool:
     """By squares [block] that volumes without and with motion leave of views held out."""
     return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
+
+
+def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
+    """The volumes as factors of their mean, so smooth; unchanged where the steps to them are ended."""
+    stop, problem = fit.stop, _of_factors(fit.views, made.volumes, made.grid, fit.stop)
+    steps = Countdown(lambda after: go_on(-after, made.residual), SOLUTION_STEPS)
+    factors = problem.solved(smooth, problem.ones(), steps)
+    if not steps.going or stop():
+        return made
+    fit.stop = lambda: False
+    changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
+    return replace(made, volumes=changed, residual=fit.residual_of(changed), smooth=smooth)
 
 
 def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:

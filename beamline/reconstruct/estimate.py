@@ -112,12 +112,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
             refuse_slabs(options.partial, slabs, needs, allowed)
     output, meanwhile = (needs.volume, 0) if fits else options.disk_needs(needs.volume)
     scratch = 0 if fits else needs.line_integrals + meanwhile
-    free = shutil.disk_usage(options.target.output.parent).free
-    if scratch + output > free:
-        raise DataError(
-            f"{options.target.output.parent} has {size(free)}, and {size(scratch + output)} are needed. Write "
-            f"with -o to another disk, or give --bin {2 * options.selection.binning}."
-        )
+    free = _room(options, scratch + output)
     heights = [slab.slices.stop - slab.slices.start for slab in missing]
     try:
         costs = costs_of(needs.method, parts_of(geometry, heights), decided=options.partial is not None)
@@ -135,3 +130,15 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
         needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
         None if span is None else times * span.most, None if span is None else times * span.least,
     )  # fmt: skip
+
+
+def _room(options: ReconOptions, needed: int) -> int:
+    """Bytes that the disk of the output has. DataError where that is less than what is needed."""
+    folder = options.target.output.parent
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise DataError(
+            f"{folder} has {size(free)}, and {size(needed)} are needed. Write with -o to another disk, or give --bin "
+            f"{2 * options.selection.binning}."
+        )
+    return free
