@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from recon.base.choices import KERNEL
+from recon.base.choices import DEFAULT_STEPS, KERNEL
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
@@ -16,7 +16,7 @@ NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model
 
 # Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
 # Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
-_TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
+_TV_OF_NOISE, _TV_MOST = 3e5, 0.25
 # Matter that changes more from voxel to voxel needs less of it: as for a prior of Laplace, noise counts by that change.
 # On a thorax, a walnut and a battery it is 0.09 to 0.17 of the density unit, on a thin-walled teapot 0.33.
 _TV_CHANGE = 0.16
@@ -34,7 +34,8 @@ class FitSettings:
         ssim_weight: of 1 - SSIM beside it.
         tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
             times the density unit). That is divided by the pixels of a Gaussian. Where matter changes by more than 0.16
-            of the density unit a voxel, it falls with the square of this change. It is kept between 0.02 and 0.25.
+            of the density unit a voxel, it falls with the square of this change. It is at most 0.25.
+        tv_least: the least of these weights, in a fit of `paced_for` steps; more steps need less, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
         tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
@@ -44,6 +45,7 @@ class FitSettings:
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
             Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
             higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
+        paced_for: steps of the longest fit that `pace` holds for, see `in_steps`.
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.
@@ -58,10 +60,12 @@ class FitSettings:
     loss: Loss = "l1"
     ssim_weight: float = 0.25
     tv_weight: float | None = None
+    tv_least: float = 0.02
     tv_size: int | None = None
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
     pace: float = 26.0
+    paced_for: int = DEFAULT_STEPS
     decay: float = 0.08
     policy: DensityPolicy | None = field(default_factory=DensityPolicy)
     truncation: Truncation = field(default_factory=Truncation)
@@ -73,13 +77,13 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
-        for name in ("views_per_step", "joined_pixels", "tv_size"):
+        for name in ("views_per_step", "joined_pixels", "tv_size", "paced_for"):
             value = getattr(self, name)
-            if value is None and name != "views_per_step":
+            if value is None and name in ("joined_pixels", "tv_size"):
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
-        for name in ("ssim_weight", "tv_weight"):
+        for name in ("ssim_weight", "tv_weight", "tv_least"):
             weight = getattr(self, name)
             if weight is not None and not 0 <= weight < math.inf:
                 raise ValueError(f"{name} must be finite and 0 or more, got {getattr(self, name)}")
@@ -92,6 +96,25 @@ class FitSettings:
             )
 
 
+def in_steps(settings: FitSettings, steps: float) -> FitSettings:
+    """The settings of a fit of so many steps, where these are more than `paced_for`.
+
+    Its rates fall with their square root. The least weight of total variation, which a short fit needs to be smooth,
+    falls with the steps.
+    """
+    share = share_of_prior(settings, steps)
+    return replace(settings, pace=share * settings.pace, tv_least=share**2 * settings.tv_least)
+
+
+def share_of_prior(settings: FitSettings, steps: float) -> float:
+    """The share of its prior, and of its sweeps, that the finish of so long a fit keeps where voxels are coarse.
+
+    Views held out choose the prior for volumes that begin at FBP, and too heavy where voxels are coarse. A longer fit
+    has explained more, and a whole finish takes it away: 3.8 dB of a teapot after 1600 steps (docs/choosing.md).
+    """
+    return min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
+
+
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
     """The weight of total variation in a fit of at most `count` Gaussians: as set, or by the noise of the data."""
     if settings.tv_weight is not None:
@@ -99,7 +122,7 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
     sharp = max(problem.change / _TV_CHANGE, 1.0)
-    return min(max(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, _TV_RANGE[0]), _TV_RANGE[1])
+    return min(max(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, settings.tv_least), _TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
