@@ -240,10 +240,14 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
 
 @dataclass
 class _Finish:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow."""
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow.
+
+    `share`: of the prior that views held out choose.
+    """
 
     iterations: int
     patches: bool
+    share: float
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
@@ -251,7 +255,9 @@ class _Finish:
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
-        return refine(problem, x, weight, strength, self.iterations, PnpDct().iterations)
+        if not isinstance(weight, NoiseBalance):
+            weight *= self.share
+        return refine(problem, x, weight, self.share * strength, self.iterations, PnpDct().iterations)
 
 
 class Finished(NamedTuple):
@@ -269,6 +275,7 @@ def finish(
     settings: FitSettings | None = None,
     control: RunControl | None = None,
     nonnegative: bool = True,
+    share: float = 1.0,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -282,12 +289,13 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, and the weights of their rays.
-        sweeps: of total variation, 1 or more; None: 8, and steps with sparse patches where these predict views held out
-            better.
+        sweeps: of total variation, 1 or more; None: 8 times `share`, and steps with sparse patches where these predict
+            views held out better.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. Its decisions may
             hold the prior, see `judged`.
         nonnegative: voxels below zero are clipped.
+        share: of the prior that views held out choose from FBP, see `settings.share_of_prior`.
 
     Raises:
         ValueError: for shapes that disagree, or no sweeps.
@@ -302,9 +310,9 @@ def finish(
     beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views), FINISH_SWEEPS if sweeps is None else sweeps
+    watch, count = _Watch(control, problem.geometry.n_views), sweeps or max(1, round(share * FINISH_SWEEPS))
     refined = solve(
-        _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
+        _Finish(count, sweeps is None, share), projector, data, weight=weights, start=start, nonnegative=nonnegative,
         watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)

@@ -22,6 +22,7 @@ from recon.reconstruction import reconstruct
 from recon.splatting.finish import Candidates, finish, judged
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
@@ -221,3 +222,16 @@ def test_a_stop_ends_the_trials() -> None:
     stop = RunControl(lambda: next(looks, True))
     tried = judged(_problem(data), R2().fit, stop, Mock())
     assert tried.by_voxels is None and not tried.prior
+
+
+@pytest.mark.parametrize(("voxels", "sweeps", "seconds"), [(24, 8, None), (12, 4, 1e6)])
+def test_a_longer_fit_changes_less(voxels: int, sweeps: int, seconds: float | None) -> None:
+    """Four times the steps: half the rates, and half the finish where voxels are coarse; so by a clock, too."""
+    cone = Geometry.cone(np.linspace(0, 2 * math.pi, 20, endpoint=False), (24, 24), 1.0, 60.0, 72.0)
+    grid = Grid((voxels,) * 3, 24 * cone.sample_pitch / voxels)
+    data = Projector(cone, grid).forward(np.pad(np.full((6, 6, 6), 0.1, np.float32), (voxels - 6) // 2))
+    settings = FitSettings(paced_for=2, tv_size=8)
+    method = R2(steps=8, seconds=seconds, gaussians=30, fit=settings)
+    made = reconstruct(data, cone, method, grid=grid).settings
+    assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 4)
+    assert made["finish"] == sweeps
