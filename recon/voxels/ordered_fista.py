@@ -39,7 +39,7 @@ class Subsets:
 
     @classmethod
     def of(cls, problem: VoxelProblem, most: int) -> Subsets:
-        """At most so many; each has at least twelve views, if that leaves four."""
+        """At most so many; each has at least twelve views, if that leaves three."""
         projector, weight = problem.projector, problem.weight
         count = subsets_of(projector.geometry, most)
         if count == 1:
