@@ -5,10 +5,10 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
@@ -18,6 +18,9 @@ from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
 from recon.voxels.emission import Emission, weighted_lines
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def reconstruct(
@@ -109,6 +112,7 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         f"device {device!r}": ("device", device != "cpu"),
         "held_out": ("held_out", len(use.held_out) > 0),
         "times": ("in_time", use.times is not None),
+        "energies": ("by_energy", use.energies is not None),
         "resume": ("checkpoints", control.resume is not None),
         "on_checkpoint": ("checkpoints", control.on_checkpoint is not None),
     }
@@ -131,7 +135,7 @@ def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> t
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:
-    given = np.asarray(projections.detach() if isinstance(projections, Tensor) else projections)
+    given = np.asarray(projections.detach() if hasattr(projections, "detach") else projections)  # a tensor
     if given.dtype.kind not in "fiub":
         raise ValueError(f"projections must be real numbers, got {given.dtype}")
     expected = (geometry.n_views, *geometry.detector_shape)

@@ -15,24 +15,15 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.adam import adam_all, add_lengths
-from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, camera, grid_layout
-from recon.kernels.cpu.footprints import HIDDEN
-from recon.kernels.cpu.losses import total_variation
+from recon.methods import DEFAULT, by_name
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import finish
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.gaussians import Gaussians
-from recon.splatting.r2 import R2
-from recon.splatting.settings import FitSettings
-from recon.splatting.splat import project
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
-from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.view_weights import cone_weights, missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
-_IN_TIME = 12  # times these views, for methods of volumes in time
+_SEVERAL = 12  # times these views, for methods of several volumes
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 _RECONSTRUCTED: set[tuple[object, ...]] = set()
 """Toys, with what they were reconstructed by, whose kernels this process has loaded."""
@@ -54,7 +45,7 @@ def warm_up(
     add a sixth of that time. A start by TV adds a third, a short scan of a cone with exact rays two thirds.
 
     Args:
-        method: with the settings of the run to come; None: `R2` with its defaults.
+        method: with the settings of the run to come; None: the default one, with its defaults.
         geometry: of the run to come; None: a parallel beam, straight.
         weighted: its rays have weights, or values that are not finite.
         on_kernel: called with the number of functions compiled so far, after each; never if all are cached.
@@ -62,16 +53,17 @@ def warm_up(
     Raises:
         ValueError: the method does not take such views.
     """
-    method = method or R2()
+    method = method or by_name(DEFAULT)()
     if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
         cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry, _IN_TIME if method.traits.in_time else 1)
+    data, views = toy_of(geometry, _SEVERAL if method.traits.several else 1)
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
     with counted(on_kernel or (lambda n: None)):
-        for warmed in (method, PnpDct()) if isinstance(method, FitMethod) else (method,):  # a fit may end with patches
+        # A fit may end with patches.
+        for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
             toy, on = warmed.toy(), device if warmed is method else "cpu"
             if (key := (type(toy), repr(toy), pickle.dumps(views), on, weighted)) not in _RECONSTRUCTED:
                 reconstruct(data, views, toy, device=on, use=DataUse(weights))
@@ -86,6 +78,14 @@ def warm_up_rest() -> None:
     So two processor cores compile. The box of voxels and the end of a step are compiled first, since `warm_up` reaches
     them last. The kernels of the finish follow.
     """
+    from recon.kernels.cpu.adam import adam_all, add_lengths
+    from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, camera, grid_layout
+    from recon.kernels.cpu.footprints import HIDDEN
+    from recon.kernels.cpu.losses import total_variation
+    from recon.splatting.finish import finish
+    from recon.splatting.gaussians import Gaussians
+    from recon.splatting.settings import FitSettings
+
     views = _views_like(None)
     grid, one = Grid.matching(views), np.ones(1, np.float32)
     blob = Active(_rows(3), _rows(3) + 2, np.eye(3, dtype=np.float32).reshape(1, 9), one, FitSettings().kernel)
@@ -101,7 +101,9 @@ def warm_up_rest() -> None:
     hidden.table.fill(HIDDEN)
     RenderedView(image, blob, camera(views, 0), 0.0, hidden, none, None).backward(image, into, _rows(2))
     data, views = toy_of()
-    finish(Volume(volume, grid), _blob(views), ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
+    width, rho = _blob(views)
+    gaussians = Gaussians.from_physical(np.zeros((1, 3)), np.array([width]), np.array([rho]), kernel=blob.kernel)
+    finish(Volume(volume, grid), gaussians, ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
 
 
 def _rows(n: int) -> F32:
@@ -127,7 +129,7 @@ def counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
 
 
 def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geometry]:
-    """Line integrals [view, row, col] of a blob in four small views for which the same kernels run as for `geometry`.
+    """Line integrals [view, row, col] of a Gaussian in four small views, which run the same kernels as `geometry`'s.
 
     The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around. They
     come so many `times`, one after the other.
@@ -135,7 +137,15 @@ def toy_of(geometry: Geometry | None = None, times: int = 1) -> tuple[F32, Geome
     once = views = _views_like(geometry)
     for _ in range(times - 1):
         views = views.followed_by(once)
-    return np.tile(project(_blob(once), once).numpy(), (times, 1, 1)), views
+    width, density = _blob(once)
+    rows, cols = (np.arange(n) for n in once.detector_shape)
+    col, row = np.array([once.origin(view) for view in range(once.n_views)]).T[:, :, None]
+    u, v = (cols - col) * once.pixel_pitch, (rows - row) * once.pixel_pitch
+    from_axis = u[:, None, :] ** 2 + v[:, :, None] ** 2  # where the ray meets the detector, mm²
+    if once.is_cone:  # where it passes the origin
+        from_axis *= once.sod**2 / (once.sdd**2 + from_axis)
+    lines = density * width * np.sqrt(2 * np.pi) * np.exp(-from_axis / (2 * width**2))
+    return np.tile(lines.astype(np.float32), (times, 1, 1)), views
 
 
 def _views_like(geometry: Geometry | None) -> Geometry:
@@ -154,8 +164,7 @@ def _views_like(geometry: Geometry | None) -> Geometry:
     return views
 
 
-def _blob(views: Geometry) -> Gaussians:
+def _blob(views: Geometry) -> tuple[float, float]:
+    """Standard deviation in mm and density in 1/mm of a Gaussian at the origin."""
     width = 2 * views.sample_pitch
-    return Gaussians.from_physical(
-        np.zeros((1, 3)), np.array([width]), np.array([0.2 / width]), kernel=FitSettings().kernel
-    )
+    return width, 0.2 / width

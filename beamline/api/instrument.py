@@ -16,8 +16,7 @@ from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
 from beamline.core.run_result import RunResult
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import printable
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
@@ -125,11 +124,11 @@ class Instrument:
         self, config: Config, output: str | Path | None, live: bool, stop: StopRequest,
         on_event: Callable[[Event], None] | None,
     ) -> ScanResult:  # fmt: skip
-        self.last, said = None, list[ScanDone | ReconDone]()
+        self.last, ends = None, list[ScanDone | ReconDone]()
 
         def remember(event: Event) -> None:
             if isinstance(event, ScanDone | ReconDone):
-                said.append(event)
+                ends.append(event)
 
         def say(event: Event) -> None:
             if self._say is not None and not isinstance(event, RunDone) and (text := sentence(event)):
@@ -149,7 +148,7 @@ class Instrument:
             if not stop.enough:
                 raise
         finally:
-            self.last = _result(said)
+            self.last = _result(ends)
         assert self.last is not None
         return self.last
 

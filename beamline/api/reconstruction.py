@@ -15,7 +15,7 @@ from beamline.api.instrument import Say, to_stderr
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
-from beamline.core.signals import StopOnSignal
+from beamline.core.stop import StopOnSignal
 from beamline.projections.selection import Selection
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
@@ -107,8 +107,8 @@ def selection_of(
     binning: int | None,
 ) -> Selection:
     """The selection with what is said beside it."""
-    said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
-    return replace(selection or Selection(), **{name: value for name, value in said.items() if value is not None})
+    stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
+    return replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
 
 
 @contextmanager

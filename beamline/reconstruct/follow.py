@@ -65,6 +65,7 @@ def follow(
     """
     rhythm = rhythm or FollowTiming()
     method = options.streaming
+    options.refuse_contradictions("follow")
     views = options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.jumps import Jumps
@@ -42,6 +41,7 @@ from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.stop import Stop
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
 from recon.splatting.stream import StreamingFit
@@ -323,7 +323,7 @@ class ScanFollower:
         prepared = self._prepared(self.axis_col, usable)
         self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
 
-        last, stop_latch = self._clock.now(), StopLatch(should_stop)
+        last, stop = self._clock.now(), Stop(should_stop)
 
         def on_progress(progress: Progress) -> bool:
             nonlocal last
@@ -331,7 +331,7 @@ class ScanFollower:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return stop_latch()
+            return stop()
 
         try:
             self._say(self._fit.finish(seconds, on_progress))
@@ -339,19 +339,19 @@ class ScanFollower:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians
         sweeps = self._options.streaming.finish_sweeps
-        if sweeps and gaussians is not None and not stop_latch():
+        if sweeps and gaussians is not None and not stop():
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())
             problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
             say = progress_events(self._sink, self._clock)
-            control = RunControl(stop_latch, say, now=self._clock.now)
+            control = RunControl(stop, say, now=self._clock.now)
             volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, control)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
             "finish": sweeps,
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if stop_latch.stopped else {}),
+            **({"ended_early": True} if stop.stopped else {}),
         }
         method, elapsed = self._options.method.name, self._clock.now() - self._begin
         history = tuple(self._history)
@@ -382,11 +382,11 @@ class ScanFollower:
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
-                if done[step.name].said:
+                if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
                     self._fit.replace_views(projections.data)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""
-        corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)
+        corrections_done({name: each.sentence for name, each in done.items()}, self._sink, self._clock)

@@ -1,4 +1,4 @@
-"""Grid, Volume and VolumesInTime: a box of voxels in the object's frame, and the attenuation in it."""
+"""Grid, Volume and VolumeSeries: a box of voxels in the object's frame, and the attenuation in it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.empirical import COARSEST, WIDER
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
-
-# Width of a fit's box over the field, if the sample is wider. Gains on two regions of interest: 2.0 and 3.8 dB. 1.4
-# gains as much there, but loses 0.5 to 1.5 dB if the matter ends with the box (1.2: 0 and 0.8).
-_WIDER = 1.2
-_COARSEST = 4.0  # pixels: largest voxel of a fit's box, even if the requested volume is coarser
 
 
 @dataclass(frozen=True)
@@ -91,9 +87,9 @@ class Grid:
         from which a fit can start.
         """
         pixel = geometry.sample_pitch
-        edge = min(max(wanted.voxel_size, pixel), _COARSEST * pixel)
+        edge = min(max(wanted.voxel_size, pixel), COARSEST * pixel)
         field = cls.of_field(geometry, edge)
-        return field.widened(_WIDER, geometry) if wider else field
+        return field.widened(WIDER, geometry) if wider else field
 
     def widened(self, by: float, geometry: Geometry) -> Grid:
         """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
@@ -204,23 +200,30 @@ class Volume:
 
 
 @dataclass(frozen=True, eq=False)
-class VolumesInTime:
-    """Volumes of a sample that changes.
+class VolumeSeries:
+    """Volumes that all views determine together: of a sample that changes, or of each of its materials.
 
     Attributes:
-        seconds: float64 [time], from the first view on.
-        data: float32 [time, z, y, x], or a dataset of a file.
-        residual: what they leave of the views, each view at its time, over the views (root mean squares); NaN as read
-            from a file, whose metrics have it.
+        seconds: float64 [volume], from the first view on; empty where they are of materials.
+        data: float32 [volume, z, y, x], or a dataset of a file.
+        residual: what they leave of the views, each view with the mixture that it shows, over the views (root mean
+            squares); NaN as read from a file, whose metrics have it.
+        names: of the materials; empty where they are of times.
     """
 
     seconds: NDArray[np.float64]
     data: Any
     residual: float = math.nan
+    names: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A short text on each, for people."""
+        return self.names or tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
         """The volumes, which are read where they are sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
+        return [_VolumeAt(self.data, at) for at in range(len(self.labels))]
 
 
 class _VolumeAt:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import ClusterError, kmeans2
 
 from recon.base.arrays import F64
 
@@ -89,6 +88,8 @@ def _sampled(values: NDArray[np.floating], seed: int) -> F64:
 
 def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
     """Centres, rising, and the mean squared distance to them."""
+    from scipy.cluster.vq import ClusterError, kmeans2
+
     if np.unique(sample).size < k:
         raise ValueError(f"{np.unique(sample).size} different grey values do not make {k} clusters")
     best: tuple[F64, float] | None = None

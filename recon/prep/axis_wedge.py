@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy import fft
 
@@ -25,6 +25,7 @@ from recon.prep.axis_search import (
 
 _MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for 0.1 px
 _STEP = 0.25  # px between candidates
+_ROUNDING = 1e-10  # of a vector's length
 _WIDEST_GAP = np.deg2rad(20)  # share of a half turn; with a wider gap the double wedge does not determine the axis
 
 
@@ -161,6 +162,28 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimat
     return AxisEstimate(value, *within(search, full, curve), depth > 0.5 and bands < AGREE * bin_, "double wedge")
 
 
+def _orthonormal(vectors: Floats) -> tuple[Floats, Floats]:
+    """Orthonormal vectors [i, k], the first m of which span the first m given ones, and how much each of these adds.
+
+    At most as many as there are components; zeros for a vector that adds nothing. Gram-Schmidt, twice for rounding
+    errors (Giraud et al. 2005). LAPACK's threads would spin, and take 20 times as long where others use the cores.
+    """
+    q = vectors[: vectors.shape[1]].copy()
+    lengths = np.zeros(len(q))
+    for i, vector in enumerate(q):
+        before = math.sqrt(float(np.einsum("k,k->", vector, vector)))
+        for again in (False, True):
+            vector -= np.einsum("j,jk->k", np.einsum("jk,k->j", q[:i], vector), q[:i])
+            length = math.sqrt(float(np.einsum("k,k->", vector, vector)))
+            if not again:
+                lengths[i] = length
+            if length <= _ROUNDING * before:
+                vector[:] = 0
+                break
+            vector /= length
+    return q, lengths
+
+
 def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     """Frequencies ω [k], coefficients [3, row, k] of each row's residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
     views, rows, cols = data.shape
@@ -183,13 +206,12 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
         columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
         if first == 0:  # sin 0
             columns, order = np.delete(columns, 1, 1), np.delete(order, 1)
-        # Nested: the first m columns of q span the first m harmonics. With torch: NumPy's threads
-        # spin, which takes seconds where other processes use the cores.
-        q, r = (part.numpy() for part in torch.linalg.qr(torch.from_numpy(columns)))
-        independent = np.abs(np.diag(r)) > 0.05 * np.sqrt(views)
-        q, order = torch.from_numpy(q[:, independent]), order[: len(independent)][independent]
+        # Nested: the first m rows of q span the first m harmonics.
+        q, lengths = _orthonormal(columns.T)
+        independent = lengths > 0.05 * np.sqrt(views)
+        q, order = q[independent], order[: len(independent)][independent]
         allowed = order[:, None] <= harmonics
-        in_re, in_im = ((q.T @ torch.from_numpy(part)).numpy().reshape(-1, rows, k.size) for part in (re, im))
+        in_re, in_im = ((q @ part).reshape(-1, rows, k.size) for part in (re, im))
         return [
             (x * y).reshape(views, rows, -1).sum(axis=0) - (u * v * allowed[:, None]).sum(axis=0)
             for x, y, u, v in ((re, re, in_re, in_re), (im, im, in_im, in_im), (re, im, in_re, in_im))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from recon.base.arrays import F32, F64
 
@@ -96,10 +95,12 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     def residuals(x: F64) -> F64:
         return np.asarray(of(x[0] + x[1], x[0], x[2]) - p)
 
+    from scipy.optimize import least_squares  # half a second
+
     bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
-    found = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
-    hard, more, share = found.x
-    explained = 1 - float(np.mean(found.fun**2) / p.var())
+    solution = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
+    hard, more, share = solution.x
+    explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
             f"thickness explains {max(explained, 0):.0%} of the line integrals, of one material it would be "

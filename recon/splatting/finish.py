@@ -14,10 +14,18 @@ from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
+from recon.base.empirical import (
+    FAR_BEHIND,
+    FEW_WILD,
+    FINISH_SWEEPS,
+    FIRST_SHARE,
+    TRIAL_STEPS,
+    TRIAL_THRESHOLD,
+    WILD_RAY,
+)
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
@@ -27,24 +35,15 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
-from recon.voxels.iterative import prior_decisions, solve
-from recon.voxels.methods.pnp_dct import TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.iterative import Watch, prior_decisions, solve
+from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
+from recon.voxels.pnp_dct import pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 
-SWEEPS = 8  # Sweeps over the views where no number is given
-
 SUBSETS, TV_STEPS = 9, 3
-
-FIRST_SHARE = 0.25  # of the steps of a trial fit, after which it is looked at first
-# Residual over that of voxels, from which on a fit does not catch up in four times the steps. Where one was behind
-# after a quarter, it gained 0.2 to 3.1 dB (eight scans). Those that won were at most 2.0 dB behind, others 3.6 or more.
-_FAR = 10 ** (3 / 20)
-
-_WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
 class _Watch:
@@ -55,7 +54,7 @@ class _Watch:
         self._begin, self._trials, self.ended = control.now(), 0, False
 
     def asked(self) -> bool:
-        self.ended = self._control.should_stop is not None and self._control.should_stop()
+        self.ended = self._control.stop()
         return self.ended
 
     def trial(self) -> bool:
@@ -116,7 +115,7 @@ class _Planning:
         judge = HeldOutTrial.of(problem)
         if judge is None:
             return x
-        weight = choose_weight(problem, x, modelled=False, trial=lambda: judge)
+        weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
         patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
@@ -130,7 +129,7 @@ class _Planning:
             tried.fit = self.of_fit(judge, weight, patches.strength if patches.better else 0.0, share)
             if tried.fit is None or beyond_chance(voxels - tried.fit, 1.0):
                 break
-            if tried.fit.mean() > _FAR * voxels.mean():
+            if tried.fit.mean() > 10 ** (FAR_BEHIND / 20) * voxels.mean():
                 break
         return x
 
@@ -153,7 +152,9 @@ class _Planning:
             )
         )
         refined = trial.made(
-            lambda some, x: refine(_without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, SWEEPS, TRIAL_STEPS),
+            lambda some, x: refine(
+                _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
+            ),
             volume_lines(np.maximum(_middle_of(fitted.volume.data, part.projector.grid.shape), 0)),
         )
         residuals = trial.residuals(refined, other)
@@ -182,6 +183,8 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, volume: Volume, setting
     """
     grid = volume.grid
     if not is_coarse(views, grid):
+        import torch
+
         half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
         outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
         gaussians = gaussians.select(outside.any(dim=1))
@@ -227,7 +230,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     watch, decide = _Watch(control, problem.geometry.n_views), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
-    solve(method, projector, data, weight=weights, on_trial=watch.trial, decide=decide)
+    solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
     if watch.ended or "strength" not in decide.made:
         return Candidates()
     tried = method.tried
@@ -244,7 +247,7 @@ class _Finish:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
-        weight, strength = choose_weight(problem, x, modelled=True, trial=trial), 0.0
+        weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
@@ -299,10 +302,10 @@ def finish(
     beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views), SWEEPS if sweeps is None else sweeps
+    watch, count = _Watch(control, problem.geometry.n_views), FINISH_SWEEPS if sweeps is None else sweeps
     refined = solve(
         _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
-        on_iteration=lambda sweep, _: watch.sweep(sweep, max(sweep, count)), on_trial=watch.trial, decide=decide,
+        watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)
 
@@ -322,8 +325,8 @@ def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, 
 
     The fit, which counts absolute differences, is not led astray by them; squares would be.
     """
-    wild = np.abs(data - model) > _WILD * float(model.max())
-    if not 0 < np.count_nonzero(wild) < _FEW * wild.size:
+    wild = np.abs(data - model) > WILD_RAY * float(model.max())
+    if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return data, weights
     kept = np.where(wild, np.float32(0), np.float32(1) if weights is None else weights)
     return masked(data, kept)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
-from recon.base.choices import Start
-from recon.base.geometry import Geometry
-from recon.base.method import Clock, Method
-from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import FitSettings
-from recon.splatting.stream import StreamingFit
+from recon.base.method import Method
+
+if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
+    from recon.base.choices import Start
+    from recon.base.geometry import Geometry
+    from recon.base.method import Clock
+    from recon.splatting.gaussians import Gaussians
+    from recon.splatting.settings import FitSettings
+    from recon.splatting.stream import StreamingFit
 
 
 @runtime_checkable

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
@@ -91,7 +92,9 @@ class Gaussians:
     @property
     def densities(self) -> Tensor:
         """ρ [n] in 1/mm."""
-        return self.density_unit * torch.nn.functional.softplus(self.raw_densities)
+        from torch.nn.functional import softplus
+
+        return self.density_unit * softplus(self.raw_densities)
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a mask or positions), as copies."""
@@ -107,7 +110,9 @@ class Gaussians:
 
         The inverse is `from_physical`.
         """
-        turned = torch.nn.functional.normalize(self.quaternions, dim=1)
+        from torch.nn.functional import normalize
+
+        turned = normalize(self.quaternions, dim=1)
         values = {"centres": self.means, "widths": self.scales, "rotations": turned, "densities": self.densities}
         return {name: value.detach().cpu().numpy() for name, value in values.items()}
 
@@ -120,6 +125,8 @@ def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaus
     """
     if not geometry.skew:
         return gaussians
+    import torch
+
     rows = gaussians.means[:, 2] / geometry.pixel_pitch + geometry.axis_row
     turn = sense * geometry.skew * rows
     c, s = torch.cos(turn), torch.sin(turn)
@@ -140,4 +147,6 @@ def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())
+    from torch import from_numpy
+
+    return from_numpy(np.ascontiguousarray(values, np.float32).copy())

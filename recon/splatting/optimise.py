@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
@@ -162,6 +161,8 @@ def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: 
 
 def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussians:
     """A copy of the model."""
+    import torch
+
     device = backend or Cpu()
     means, log_scales, quaternions, raw = (
         torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES
@@ -243,7 +244,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
     statistic = backend.numpy(state.statistic) / np.float32(max(1, state.seen))
     change = control(
-        p["means"], p["log_scales"], active.rotations, p["raw"], statistic, policy,
+        (p["means"], p["log_scales"], active.rotations, p["raw"]), statistic, policy,
         2 * problem.half_field, state.limit, problem.grid.edges, state.rng,
     )  # fmt: skip
     origin = np.concatenate((change.keep, change.parents))

@@ -8,77 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Literal
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
-from recon.kernels import reference
-from recon.splatting.backend import Backend, Cpu, Pass
+from recon.splatting.backend import Backend, Cpu
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 Implementation = Literal["auto", "cpu", "gpu", "reference"]
-
-
-class Project(torch.autograd.Function):
-    """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], geometry: Geometry, faint: float, cut: float, model: RayModel,
-    ) -> Tensor:  # fmt: skip
-        ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), geometry, (faint, cut, model)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
-        images = means.new_empty((geometry.n_views, *geometry.detector_shape))
-        for view, image in enumerate(images):
-            image.copy_(torch.as_tensor(run.view(geometry, view, faint, cut, model).image))
-        return images
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, geometry, how = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
-        for view, slope in enumerate(gradient):
-            run.view(geometry, view, *how).backward(_native(slope, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 7)
-
-
-class Voxelize(torch.autograd.Function):
-    """Voxels of raw parameters on a backend."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], grid: Grid, faint: float, cut: float,
-    ) -> Tensor:  # fmt: skip
-        ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), (grid, faint, cut)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
-        return torch.as_tensor(run.box(grid, faint, cut).density)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, where = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
-        run.box(*where).backward(_native(gradient, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 6)
-
-
-def _begin(parameters: Sequence[Tensor], unit: float, kernel: Kernel, backend: Backend[Any]) -> Pass[Any]:
-    means, log_scales, quaternions, raw = (_native(tensor, backend) for tensor in parameters)
-    return backend.begin(means, log_scales, quaternions, raw, unit, kernel)
-
-
-def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
-    """The values as an array of the backend, without a copy where they are contiguous."""
-    values = tensor.detach().contiguous()
-    return values.numpy() if isinstance(backend, Cpu) else values
 
 
 def project(
@@ -99,6 +40,11 @@ def project(
         ValueError: the implementation does not support tensors of this type or on this device.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
+    import torch
+
+    from recon.kernels import reference
+    from recon.splatting.autograd import Project
+
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
     g, which = turned_by_rows(gaussians, chosen, -1), _chosen(gaussians, implementation)
@@ -116,30 +62,37 @@ def project(
             )
         return torch.stack(images)
     cut = truncation or Truncation()
-    return Project.apply(*_raw(g, which), chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+    return Project.apply(*_raw(g, which), chosen, (_faint(cut, g, chosen), cut.sigmas, rays))
 
 
 def voxelize(
     gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, implementation: Implementation = "auto"
 ) -> Tensor:
     """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
+    import torch
+
+    from recon.kernels import reference
+    from recon.splatting.autograd import Voxelize
+
     g, which = gaussians, _chosen(gaussians, implementation)
     if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
         return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
     cut = truncation or Truncation()
-    return Voxelize.apply(*_raw(g, which), grid, cut.faint * g.density_unit, cut.sigmas)
+    return Voxelize.apply(*_raw(g, which), grid, (cut.faint * g.density_unit, cut.sigmas))
 
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
     """The first arguments of `Project` and `Voxelize`."""
+    from recon.splatting.autograd import On
+
     if implementation == "gpu":
         from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
 
         backend: Backend[Any] = Gpu(g.means.device)
     else:
         backend = Cpu()
-    return g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, g.kernel, backend
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, On(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:
@@ -148,6 +101,8 @@ def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> 
 
 
 def _chosen(gaussians: Gaussians, implementation: Implementation) -> Implementation:
+    import torch
+
     dtype, device = gaussians.means.dtype, gaussians.means.device.type
     suited: Implementation = "reference" if dtype != torch.float32 else "cpu" if device == "cpu" else "gpu"
     chosen = suited if implementation == "auto" else implementation

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from recon.base.arrays import F64
-from recon.kernels.reference import rotation_matrices
 from recon.splatting.gaussians import Gaussians
 
 _SIGMAS = 5.0  # where a true Gaussian ends: exp(-12.5)
@@ -19,6 +17,10 @@ def density_at(gaussians: Gaussians, points: F64) -> tuple[F64, F64]:
 
     With d from the centre, A = Σ⁻¹ and q = dᵀAd, a Gaussian adds ρ f(q) to σ and 2 ρ f'(q) A d to its gradient.
     """
+    from scipy.spatial import cKDTree
+
+    from recon.kernels.reference import rotation_matrices  # loads torch
+
     kernel, n = gaussians.kernel, len(points)
     density, gradient = np.zeros(n), np.zeros((n, 3))
     means = gaussians.means.detach().double().numpy()

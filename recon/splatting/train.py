@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
-from recon.base.choices import MODEL_STEPS
 from recon.base.decisions import Decisions
+from recon.base.empirical import MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
@@ -37,6 +37,7 @@ from recon.splatting.in_time import (
     first_sweep_seconds,
 )
 from recon.splatting.initialise import (
+    FirstVolume,
     default_count,
     joined_for,
     leaves_the_field,
@@ -227,7 +228,7 @@ class _Run:
 
     @property
     def stopped(self) -> bool:
-        return self.control.should_stop is not None and self.control.should_stop()
+        return self.control.stop()
 
     def model(self) -> tuple[Volume, Gaussians]:
         """The volume of the Gaussians, and these, turned as the rows see them."""
@@ -316,8 +317,8 @@ def _started(
         factor = 1 if method.seconds is None else _factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
             start = place(
-                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed), start=method.start,
-                rays=settings.rays, kernel=settings.kernel, factor=factor,
+                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed),
+                start=FirstVolume(method.start, factor), rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
@@ -383,7 +384,7 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
         return volume, 0
     control = replace(run.control, decide=run.decide)
     if method.seconds is not None:
-        control = replace(control, should_stop=_until(control, run.end))
+        control = control.by(run.end)
     control = replace(control, stop_trials=None if length.trials else lambda: True)
     finished, sweeps = finish(
         volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative
@@ -427,11 +428,6 @@ def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
     geometry = run.views.fitted.geometry.at_row(0)
     plan = finish_within(room, remaining - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
     return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
-
-
-def _until(control: RunControl, end: float) -> Callable[[], bool]:
-    """Stops with `control`, or when its clock shows `end`."""
-    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
 def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from recon.base.arrays import F32, F64
 from recon.kernels.cpu.warp import pull, push, slopes
@@ -82,6 +81,8 @@ def _spline(at: F64, knots: int) -> F64:
     even = np.linspace(0, 1, knots)
     if knots == 2:
         return np.stack([1 - at, at], 1)
+    from scipy.interpolate import CubicSpline  # half a second
+
     return np.asarray(CubicSpline(even, np.eye(knots), bc_type="natural")(at))
 
 

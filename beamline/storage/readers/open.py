@@ -17,7 +17,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
@@ -32,7 +32,7 @@ from beamline.storage.readers.wrapped import (
     type_wrapped,
 )
 from drivers.base.frame import FrameKind
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -55,9 +55,10 @@ def _fitting(name: str, found: Any) -> ScanFormat:
     return found
 
 
-FORMATS: tuple[ScanFormat, ...] = (
-    *(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY),
-    *plugins("reader", REGISTRY, _fitting).values(),
+FORMATS: tuple[ScanFormat, ...] = tuple(
+    Registry(
+        "reader", {name: import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY}, _fitting
+    ).values()
 )
 """Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 

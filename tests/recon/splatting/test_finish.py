@@ -168,7 +168,7 @@ def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
-    with pytest.raises(ValueError, match="finish must be 0 sweeps or more, got -1"):
+    with pytest.raises(ValueError, match="finish must be a whole number of 0 or more, got -1"):
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
     with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2, r2-published has\)"):
         build(Fbp, {"finish": 2})

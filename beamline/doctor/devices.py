@@ -1,14 +1,20 @@
-"""Doctor on the camera: USB link and vendor's library. The camera is opened only on request."""
+"""Doctor on the devices: the camera's USB link and library, and configured ports. No camera opens unless asked to, and
+no byte is sent."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import re
+import socket
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import psutil
 
@@ -18,6 +24,84 @@ from drivers import usb
 from drivers.base.errors import DeviceError
 from drivers.dcam.abi import Dcam
 from drivers.dcam.codes import Text
+from drivers.serial.ports import SerialPort
+
+CONNECT_TIMEOUT = 2.0  # s for a TCP connection
+
+
+def ports(found: Sequence[SerialPort]) -> Diagnosis:
+    """All serial ports of this computer."""
+    listed = "; ".join(map(str, found)) or "none"
+    return Diagnosis(
+        "serial ports",
+        Grade.OK if found else Grade.WARNING,
+        f"{listed}.",
+        "the adapter of a stage on a serial line (a stage on the network shows none)",
+        "" if found else "Plug the adapter in; on Linux `dmesg` shows whether the system recognised it",
+        {"ports": [vars(port) for port in found]},
+    )
+
+
+def port(name: str, url: str, found: Sequence[SerialPort]) -> Diagnosis:
+    """One device's port.
+
+    Args:
+        name: of the check.
+        url: as configured.
+        found: the serial ports of this computer.
+    """
+    if url.lower().startswith("sim://"):
+        return Diagnosis(name, Grade.NOT_APPLICABLE, f"{url} is simulated.")
+    if url.lower().startswith("socket://"):
+        return _network(name, url)
+    if "://" in url:
+        return Diagnosis(name, Grade.CANNOT_CHECK, f"{url} can only be tried by opening it.")
+    listed = "; ".join(map(str, found)) or "no serial ports"
+    known = next((one for one in found if _same(one.device, url)), None)
+    diagnosis = partial(Diagnosis, name, values={"port": url, "ports": [vars(one) for one in found]})
+    expected = f"the port {url} of the configuration"
+    if known is None and (sys.platform == "win32" or not Path(url).exists()):
+        advice = (
+            "Plug the adapter in, switch the controller on, and set the port to one of those found. A name under "
+            "/dev/serial/by-id stays the same when adapters are plugged in another order"
+        )
+        return diagnosis(Grade.FAILED, f"There is no port {url}; there are {listed}.", expected, advice)
+    if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
+        expected = f"permission to read and write {url}"
+        advice = (
+            "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again"
+        )
+        return diagnosis(Grade.FAILED, f"{known or url} may not be opened by this user.", expected, advice)
+    return diagnosis(Grade.OK, f"{known or url}.", expected)
+
+
+def _same(device: str, url: str) -> bool:
+    if sys.platform == "win32":
+        return device.upper() == url.upper().removeprefix("\\\\.\\")
+    return device == url or Path(device).resolve() == Path(url).resolve()
+
+
+def _network(name: str, url: str) -> Diagnosis:
+    """A TCP connection, opened and closed without sending anything."""
+    expected = f"a controller that accepts connections at {url}"
+    try:
+        parts = urlsplit(url)
+        host, number = parts.hostname or "", parts.port
+    except ValueError:
+        host, number = "", None
+    if not host or not number:
+        observed, advice = f"{url} is not an address.", "Correct the configuration"
+        return Diagnosis(name, Grade.FAILED, observed, "socket://host:port", advice)
+    try:
+        socket.create_connection((host, number), CONNECT_TIMEOUT).close()
+    except OSError as error:
+        advice = (
+            "Check the controller's power, its address and port on its panel, and the network. Close other programs: "
+            "many controllers accept only one connection"
+        )
+        return Diagnosis(name, Grade.FAILED, f"{host}:{number} accepts no connection ({error}).", expected, advice)
+    return Diagnosis(name, Grade.OK, f"{host}:{number} accepts connections.", expected)
+
 
 LINK, LIBRARY = "camera link", "camera library"
 _SUPERSPEED = "one Hamamatsu camera on a SuperSpeed link (5 Gbit/s or more)"
@@ -54,13 +138,15 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Diagnosis:
             LINK, Grade.NOT_APPLICABLE, "A CoaXPress camera is on its frame grabber, not on USB.", _SUPERSPEED
         )
     product, serial = (None, None) if camera is None else (camera.usb_product, camera.usb_serial)
-    found = usb.preflight(product=product, serial=serial, backend=backend)
-    verdict = _VERDICTS[found.verdict]
+    preflight = usb.preflight(product=product, serial=serial, backend=backend)
+    verdict = _VERDICTS[preflight.verdict]
     if verdict is Grade.FAILED and camera is None:
         verdict = Grade.WARNING
     otherwise = "" if verdict is Grade.OK else f"{_NO_LIBUSB}; the camera itself does not need it"
-    values = {"devices": [vars(device) for device in found.devices]}
-    return Diagnosis(LINK, verdict, found.message, _SUPERSPEED, _LINK_ADVICE.get(found.verdict, otherwise), values)
+    values = {"devices": [vars(device) for device in preflight.devices]}
+    return Diagnosis(
+        LINK, verdict, preflight.message, _SUPERSPEED, _LINK_ADVICE.get(preflight.verdict, otherwise), values
+    )
 
 
 def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
@@ -78,22 +164,22 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
     file = _loaded_file(path)
     version = version_of(file)
     values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
-    found = f"{file or path or 'the installed library'}, version {version or 'not known'}."
+    observed = f"{file or path or 'the installed library'}, version {version or 'not known'}."
     if not session:
-        return Diagnosis(LIBRARY, Grade.OK, found, expected, values=values)
+        return Diagnosis(LIBRARY, Grade.OK, observed, expected, values=values)
     index = 0 if camera is None else camera.index
     try:
         cameras = _cameras(loaded)
     except DeviceError as error:
         failure = of_error(LIBRARY, error, f"{expected}, and a camera")
-        return replace(failure, found=f"{found} {failure.found}", values=values)
+        return replace(failure, found=f"{observed} {failure.found}", values=values)
     values["cameras"] = cameras
     listed = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
     if index >= len(cameras):
-        found, expected = f"{found} {len(cameras)} cameras: {listed}.", f"a camera of index {index}"
+        observed, expected = f"{observed} {len(cameras)} cameras: {listed}.", f"a camera of index {index}"
         advice = "Set devices.camera.index to one of these cameras"
-        return Diagnosis(LIBRARY, Grade.FAILED, found, expected, advice, values)
-    return Diagnosis(LIBRARY, Grade.OK, f"{found} {listed}.", expected, values=values)
+        return Diagnosis(LIBRARY, Grade.FAILED, observed, expected, advice, values)
+    return Diagnosis(LIBRARY, Grade.OK, f"{observed} {listed}.", expected, values=values)
 
 
 def version_of(file: Path | None) -> str:
