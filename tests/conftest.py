@@ -94,7 +94,11 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
 
 
-gc.disable()  # till all is collected: a tenth of the time of collecting
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """A tenth of the time of collecting went into looking for garbage."""
+    if not getattr(session.config.option, "numprocesses", None):  # workers collect, not who leads them
+        gc.disable()
 
 
 def pytest_collection_finish() -> None:
