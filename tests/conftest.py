@@ -100,6 +100,20 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+# Not in processes that tests start, some of which run tests of another folder.
+_SKIPPED = os.environ.pop("SPLATLINE_SKIPPED", None) if "PYTEST_XDIST_WORKER" in os.environ else None
+
+
+def _note_skipped(report: pytest.CollectReport | pytest.TestReport) -> None:
+    """The gate runs what a worker skipped again, with all extras: it names a file for that in SPLATLINE_SKIPPED."""
+    if _SKIPPED and report.skipped and not hasattr(report, "wasxfail"):
+        with Path(_SKIPPED).open("a", encoding="utf-8") as file:
+            file.write(report.nodeid + "\n")
+
+
+pytest_runtest_logreport = pytest_collectreport = _note_skipped
+
+
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
 

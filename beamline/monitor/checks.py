@@ -81,7 +81,7 @@ def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
     for check, level in frames:
         if level is Level.WARN:
             frames[check, level] -= frames.get((check, Level.ALARM), set())
-    return {key: found for key, found in frames.items() if found}
+    return {key: rows for key, rows in frames.items() if rows}
 
 
 def bitmask(flags: Iterable[Flag]) -> int:

@@ -90,7 +90,7 @@ def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[st
     records: dict[str, Value] = {}
     for step in steps:
         did = done.get(step.name, StepDone())
-        sentence = {f"{step.name}_said": did.said} if did.said else {}
+        sentence = {f"{step.name}_said": did.sentence} if did.sentence else {}
         records |= _options(step) | sentence if did.parameters is None else did.parameters
     return records
 

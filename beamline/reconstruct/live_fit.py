@@ -382,11 +382,11 @@ class ScanFollower:
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
-                if done[step.name].said:
+                if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
                     self._fit.replace_views(projections.data)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""
-        corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)
+        corrections_done({name: each.sentence for name, each in done.items()}, self._sink, self._clock)

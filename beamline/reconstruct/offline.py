@@ -178,7 +178,7 @@ def require_finished(source: ScanSource, options: ReconOptions) -> None:
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Report the requested corrections of the views, then send the event `recon_started`."""
-    corrections_done({name: done.said for name, done in prepared.done.items() if not done.warned}, sink, clock)
+    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
     more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(

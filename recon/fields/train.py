@@ -130,8 +130,8 @@ class _Views:
     grid: Grid
 
     def usable(self, view: int, foreground: bool) -> Mask:
-        found = np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
-        return found & (self.data[view] > 0) if foreground else found
+        usable = np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
+        return usable & (self.data[view] > 0) if foreground else usable
 
     def of(self, view: int, pixels: Places) -> tuple[F32, F32]:
         """Values and weights of pixels."""
@@ -266,8 +266,8 @@ class _Fit:
         squares = 0.0
         for first in range(0, pixels.size, count):
             part = slice(first, first + count)
-            found = self._integrals(points[part], lengths[part])
-            loss = (self._tensor(weights[part]) * (found - self._tensor(values[part])) ** 2).sum() / pixels.size
+            integrals = self._integrals(points[part], lengths[part])
+            loss = (self._tensor(weights[part]) * (integrals - self._tensor(values[part])) ** 2).sum() / pixels.size
             loss.backward()
             squares += float(loss.detach())
         self.optimiser.step()
@@ -286,8 +286,8 @@ class _Fit:
     def _judges(self, kept: Places) -> list[tuple[int, Places]]:
         """Rays of views held out, the same at every look."""
         share = -(-_JUDGES // max(1, kept.size))
-        found = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
-        return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in found if pixels.size]
+        pixels_of_views = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
+        return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in pixels_of_views if pixels.size]
 
     @torch.no_grad()
     def _look(self, judges: list[tuple[int, Places]]) -> None:
@@ -297,8 +297,8 @@ class _Fit:
             for part in np.array_split(pixels, -(-pixels.size * self.samples // CHUNK)):
                 values, weights = self.views.of(view, part)
                 rays = rays_of(self.views.geometry, view, part, self.views.grid)
-                found = self._integrals(rays.samples(middles), rays.lengths).cpu().numpy()
-                left += float((weights * (found - values) ** 2).sum())
+                integrals = self._integrals(rays.samples(middles), rays.lengths).cpu().numpy()
+                left += float((weights * (integrals - values) ** 2).sum())
                 scale += float((weights * values**2).sum())
         self.held_out = math.sqrt(left / max(scale, 1e-30))
         self.looks += 1

@@ -17,6 +17,15 @@ import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
+from recon.base.empirical import (
+    FAR_BEHIND,
+    FEW_WILD,
+    FINISH_SWEEPS,
+    FIRST_SHARE,
+    TRIAL_STEPS,
+    TRIAL_THRESHOLD,
+    WILD_RAY,
+)
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
@@ -27,23 +36,14 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
+from recon.voxels.pnp_dct import pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 
-SWEEPS = 8  # Sweeps over the views where no number is given
-
 SUBSETS, TV_STEPS = 9, 3
-
-FIRST_SHARE = 0.25  # of the steps of a trial fit, after which it is looked at first
-# Residual over that of voxels, from which on a fit does not catch up in four times the steps. Where one was behind
-# after a quarter, it gained 0.2 to 3.1 dB (eight scans). Those that won were at most 2.0 dB behind, others 3.6 or more.
-_FAR = 10 ** (3 / 20)
-
-_WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
 class _Watch:
@@ -115,7 +115,7 @@ class _Planning:
         judge = HeldOutTrial.of(problem)
         if judge is None:
             return x
-        weight = choose_weight(problem, x, SWEEPS, lambda: judge)
+        weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
         patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
@@ -129,7 +129,7 @@ class _Planning:
             tried.fit = self.of_fit(judge, weight, patches.strength if patches.better else 0.0, share)
             if tried.fit is None or beyond_chance(voxels - tried.fit, 1.0):
                 break
-            if tried.fit.mean() > _FAR * voxels.mean():
+            if tried.fit.mean() > 10 ** (FAR_BEHIND / 20) * voxels.mean():
                 break
         return x
 
@@ -152,7 +152,9 @@ class _Planning:
             )
         )
         refined = trial.made(
-            lambda some, x: refine(_without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, SWEEPS, TRIAL_STEPS),
+            lambda some, x: refine(
+                _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
+            ),
             volume_lines(np.maximum(_middle_of(fitted.volume.data, part.projector.grid.shape), 0)),
         )
         residuals = trial.residuals(refined, other)
@@ -300,7 +302,7 @@ def finish(
     beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views), SWEEPS if sweeps is None else sweeps
+    watch, count = _Watch(control, problem.geometry.n_views), FINISH_SWEEPS if sweeps is None else sweeps
     refined = solve(
         _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
         watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
@@ -323,8 +325,8 @@ def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, 
 
     The fit, which counts absolute differences, is not led astray by them; squares would be.
     """
-    wild = np.abs(data - model) > _WILD * float(model.max())
-    if not 0 < np.count_nonzero(wild) < _FEW * wild.size:
+    wild = np.abs(data - model) > WILD_RAY * float(model.max())
+    if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return data, weights
     kept = np.where(wild, np.float32(0), np.float32(1) if weights is None else weights)
     return masked(data, kept)

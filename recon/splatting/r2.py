@@ -11,7 +11,8 @@ import numpy as np
 
 from recon.assess.plans import PRESETS, best_steps
 from recon.base.arrays import F32
-from recon.base.choices import DEFAULT_STEPS, MODEL_STEPS, Quality
+from recon.base.choices import Quality
+from recon.base.empirical import DEFAULT_STEPS, FINISH_SWEEPS, MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
@@ -19,7 +20,6 @@ from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
-from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.settings import FitSettings, growth
@@ -107,7 +107,7 @@ class R2:
 
     @property
     def finish_sweeps(self) -> int:
-        return SWEEPS if self.finish is None else self.finish
+        return FINISH_SWEEPS if self.finish is None else self.finish
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_fit(self, problem, control)

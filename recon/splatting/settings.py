@@ -6,6 +6,17 @@ import math
 from dataclasses import dataclass, field
 
 from recon.base.choices import KERNEL
+from recon.base.empirical import (
+    NARROWEST,
+    PACE,
+    TV_CHANGE,
+    TV_LEAST,
+    TV_MOST,
+    TV_OF_NOISE,
+    TV_SHARE,
+    TV_WIDEST,
+    VIEWS_A_STEP,
+)
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.settings_check import check_settings
@@ -15,15 +26,7 @@ from recon.splatting.problem import FitProblem, Loss
 
 NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 
-# Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
-# Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
-_TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
-# Matter that changes more from voxel to voxel needs less of it: as for a prior of Laplace, noise counts by that change.
-# On a thorax, a walnut and a battery it is 0.09 to 0.17 of the density unit, on a thin-walled teapot 0.33.
-_TV_CHANGE = 0.16
-# A box of a 64th of the grid: in a smaller one, a place would see total variation in rare kicks. Adam's moments take
-# these for steepness, which slows everything down (-1.8 dB on a battery of 256³ voxels).
-_TV_SHARE, _TV_SIZES = 4, (32, 96)
+TV_LEAST_SIDE = 32  # voxels of the box of total variation (Zha et al. 2024)
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,7 @@ class FitSettings:
             dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
-            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
-            higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
+            26 times as fast, with two views a step, gains 1 to 4 dB there (see docs/notes/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.
@@ -62,12 +64,12 @@ class FitSettings:
     tv_size: int | None = None
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
-    pace: float = 26.0
-    decay: float = 0.08
+    pace: float = PACE
+    decay: float = 0.1
     policy: DensityPolicy | None = field(default_factory=DensityPolicy)
     truncation: Truncation = field(default_factory=Truncation)
-    smallest: float = 0.3
-    views_per_step: int = 2
+    smallest: float = NARROWEST
+    views_per_step: int = VIEWS_A_STEP
     joined_pixels: int | None = None
     rays: RayModel = field(default_factory=RayModel)
     kernel: Kernel = KERNEL
@@ -92,16 +94,16 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
         return settings.tv_weight
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
-    sharp = max(problem.change / _TV_CHANGE, 1.0)
-    return min(max(_TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, _TV_RANGE[0]), _TV_RANGE[1])
+    sharp = max(problem.change / TV_CHANGE, 1.0)
+    return min(max(TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, TV_LEAST), TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:
     """Voxels per side of the box of total variation: as set, or by the size of the grid."""
     if settings.tv_size is not None:
         return settings.tv_size
-    side = round(math.prod(grid.shape) ** (1 / 3) / _TV_SHARE / 16) * 16  # whole lanes of the kernels
-    return min(max(side, _TV_SIZES[0]), _TV_SIZES[1])
+    side = round(math.prod(grid.shape) ** (1 / 3) / TV_SHARE / 16) * 16  # whole lanes of the kernels
+    return min(max(side, TV_LEAST_SIDE), TV_WIDEST)
 
 
 def growth(settings: FitSettings) -> float:

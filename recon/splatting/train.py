@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
-from recon.base.choices import MODEL_STEPS
 from recon.base.decisions import Decisions
+from recon.base.empirical import MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from recon.assess.plans import Speeds
+from recon.base.empirical import FINISH_SWEEPS, FIRST_SHARE, TRIAL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import CLOCK, Costs, Rates, Work
-from recon.splatting.finish import FIRST_SHARE, SUBSETS, SWEEPS, TV_STEPS
+from recon.splatting.finish import SUBSETS, TV_STEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_method
@@ -18,7 +19,6 @@ from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.pnp_dct import TRIAL_STEPS
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
@@ -48,7 +48,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     if (part := trial_part(geometry, grid)) is not None:
         share = part[0].detector_shape[0] / geometry.detector_shape[0]
         own = method.for_trial(share, FIRST_SHARE)
-        refined = fista_sweeps(*part, SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
+        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
         trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
     return Costs(volumes, weight + patches + trial)
 

@@ -256,7 +256,7 @@ def test_rings_go_by_the_public_name_and_the_views_stay() -> None:
     np.testing.assert_allclose(found.taken, (striped - found.data).mean(axis=0), atol=1e-6)
     left = (found.data - noisy)[:, 0].mean(axis=0)
     assert np.abs(left[odd]).max() < 0.02 and np.abs(left).mean() < 0.005
-    assert found.said.startswith("Rings: removed by sort")
+    assert found.sentence.startswith("Rings: removed by sort")
     for views, wanted, way in ((striped[0], "must be", "sort"), (striped, "rings is one of none, auto", "rings")):
         with pytest.raises(ValueError, match=wanted):
             recon.remove_rings(views, angles, way)  # type: ignore[arg-type]

@@ -120,7 +120,7 @@ class Calibrate:
         done = [views.done[self.name]] if self.name in views.done else []
         learn = {"background": without_learnt_background, "gains": without_learnt_gains}
         done += [learn[term](views, progress) for term in OF_VIEWS if term in self.terms]
-        sentence = " ".join(each.said for each in done if each.said)
+        sentence = " ".join(each.sentence for each in done if each.sentence)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
         return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
 
@@ -149,7 +149,7 @@ class Calibrated:
 
     @property
     def done(self) -> StepDone:
-        return StepDone(self.learnt.said(self.binning), self.learnt.parameters(self.binning))
+        return StepDone(self.learnt.in_words(self.binning), self.learnt.parameters(self.binning))
 
     @property
     def axis(self) -> float:

@@ -249,7 +249,7 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(
     run = _stopped(tmp_path, monkeypatch, at=FIRST + VIEWS, abort=True)
     stop = StopRequest()
     with open_for_resume(run) as series:
-        assert series.said.endswith("has all 12 views, its missing flats of the end are taken now")
+        assert series.in_words.endswith("has all 12 views, its missing flats of the end are taken now")
         with pytest.raises(BeamlineError, match="Interrupted before anything was acquired"):
             run_scan(
                 series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,

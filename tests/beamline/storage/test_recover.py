@@ -122,7 +122,7 @@ def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
         shutil.copy(tmp_path / "s.h5", tmp_path / "died.h5")
     done = recover(_aged(tmp_path / "died.h5"))
     assert (done.changed, done.altered) == (True, (4,))
-    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.said()
+    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.in_words()
 
 
 @pytest.mark.parametrize("ahead", [1e3, 1e6])
@@ -269,7 +269,7 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             np.testing.assert_allclose(source.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
         assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
         if (kept := folder / "s.h5.damaged").exists():
-            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.said()
+            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.in_words()
             anew += 1
         assert not recover(folder / "s.h5").changed
     assert anew  # ways that HDF5 cannot end such a file by

@@ -64,9 +64,12 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
     done = found.done["calibrate"]
-    assert done.said.startswith("Geometry learnt: the axis moves by +") and "Views held out deviate by" in done.said
+    assert (
+        done.sentence.startswith("Geometry learnt: the axis moves by +")
+        and "Views held out deviate by" in done.sentence
+    )
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
-    assert plain.done["calibrate"].said == ""
+    assert plain.done["calibrate"].sentence == ""
 
 
 def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
