@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import DataUse, Progress, Reconstruction, RunControl
+from recon.base.method import DataUse, Energies, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.compiled import use_compiled_kernels
@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     from recon.axis_by_views import axis_by_views
     from recon.energy_fit import EnergyViews
     from recon.fields.methods import NAF, IntraTomo, SaxNerf
+    from recon.joint_methods import EnergySeries, TimeSeries
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import reconstruct
     from recon.registration import register_energies
-    from recon.series import TimedViews, TimedVolumes, TimeSeries, fit_series
+    from recon.series import TimedViews, TimedVolumes, fit_series
     from recon.share_fit import fit_share
     from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
@@ -67,6 +68,8 @@ __all__ = [
     "Counts",
     "DataUse",
     "Emission",
+    "Energies",
+    "EnergySeries",
     "EnergyViews",
     "Fbp",
     "FistaTv",
@@ -124,7 +127,7 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.registration",
-    **dict.fromkeys(("TimeSeries", "TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
+    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
     "EnergyViews": "recon.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
     "fit_share": "recon.share_fit",

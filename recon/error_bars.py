@@ -19,7 +19,7 @@ from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
 from recon.voxels.direct import direct
-from recon.voxels.iterative import IterativeMethod, solve
+from recon.voxels.iterative import IterativeMethod, Watch, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.projector import Projector
@@ -173,7 +173,7 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve(
             refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
-            nonnegative=not getattr(method, "allow_negative", False), on_iteration=told, decide=decide,
+            nonnegative=not getattr(method, "allow_negative", False), watch=Watch(told), decide=decide,
         )  # fmt: skip
         if stopped:
             return None

@@ -18,7 +18,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
 from recon.base.work import Rate
-from recon.energy_fit import EnergyFit
+from recon.energy_fit import EnergyFit, EnergyViews
 from recon.fields.train import FieldMethod
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.patches import denoise, patch_scratch
@@ -259,8 +259,18 @@ def _fields(which: str) -> tuple[_Timed, ...]:
 
 
 def _series(which: str) -> tuple[_Timed, ...]:
-    how, knots = which.split()
-    return _serial(int(knots), how == "moving", 32), _serial(int(knots), how == "moving", 80)
+    how, volumes = which.split()
+    if how == "energies":
+        return _by_energy(int(volumes), 32), _by_energy(int(volumes), 80)
+    return _serial(int(volumes), how == "moving", 32), _serial(int(volumes), how == "moving", 80)
+
+
+def _by_energy(materials: int, cols: int) -> _Timed:
+    """Views, and voxels x views, of sweeps of a fit of materials at as many energies."""
+    geometry, _, data = _lines("parallel", 16, cols, 12 * materials)
+    energies = np.arange(geometry.n_views) * materials // geometry.n_views
+    views = EnergyViews(data, geometry, energies, np.eye(materials) + 0.5)
+    return _timed_sweeps(EnergyFit(views, Grid.matching(geometry), np.random.default_rng(0)), materials)
 
 
 def _serial(knots: int, moves: bool, cols: int) -> _Timed:
@@ -270,8 +280,12 @@ def _serial(knots: int, moves: bool, cols: int) -> _Timed:
     views, past = of_moments(TimedViews(data, geometry, times), np.linspace(0, times[-1], knots), MOMENTS * (knots - 1))
     nz, ny, nx = grid.shape
     fit = EnergyFit(views, grid, np.random.default_rng(0), Motion.none((ny, nx, nz), past, 3, 3) if moves else None)
-    n = float(geometry.n_views)
-    return _Timed(n, n * nz * ny * nx, lambda: list(fit.sweeps(np.full(knots, 0.1), 1)))
+    return _timed_sweeps(fit, knots)
+
+
+def _timed_sweeps(fit: EnergyFit, volumes: int) -> _Timed:
+    n = float(fit.views.geometry.n_views)
+    return _Timed(n, n * math.prod(fit.grid.shape), lambda: list(fit.sweeps(np.full(volumes, 0.1), 1)))
 
 
 OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
@@ -289,6 +303,6 @@ OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
     "view": _fitted,  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
     "draw": _draws,  # first Gaussians: Gaussians, voxels
     "fill": _fills,  # the volume of Gaussians: Gaussians, voxels
-    "series": _series,  # sweeps of volumes in time: views, voxels x views; of a sample at rest or moving, and volumes
+    "series": _series,  # sweeps of several volumes: views, voxels x views; at rest, moving or of energies, and volumes
     "field": _fields,  # steps of a neural field: samples, voxels of its volume; of a method
 }

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal
 
 from drivers.plugins import plugins
 from recon.base.choices import AUTO
@@ -25,6 +25,7 @@ class MethodEntry:
         streams: it has `stream`, so that its volume can grow while views arrive.
         compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
         emission: it is compared where the sample emits, whatever `compared` says.
+        several: what its volumes are of, where it makes several.
     """
 
     module: str
@@ -32,6 +33,7 @@ class MethodEntry:
     streams: bool = False
     compared: bool = True
     emission: bool = False
+    several: Literal["", "times", "materials"] = ""
 
 
 REGISTRY: dict[str, MethodEntry] = {
@@ -47,7 +49,8 @@ REGISTRY: dict[str, MethodEntry] = {
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
     "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
-    "series": MethodEntry("recon.series", "TimeSeries", compared=False),
+    "series": MethodEntry("recon.joint_methods", "TimeSeries", compared=False, several="times"),
+    "materials": MethodEntry("recon.joint_methods", "EnergySeries", compared=False, several="materials"),
     "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
     "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
     "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),
@@ -67,7 +70,12 @@ def names() -> tuple[str, ...]:
 
 def names_of_one_volume() -> tuple[str, ...]:
     """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
-    return tuple(name for name in names() if name != IN_TIME)
+    return tuple(name for name, entry in _entries().items() if not entry.several)
+
+
+def names_of_one_scan() -> tuple[str, ...]:
+    """Names of the methods that take one scan; loads no module of ours."""
+    return tuple(name for name, entry in _entries().items() if entry.several != "materials")
 
 
 def names_compared(emission: bool = False) -> tuple[str, ...]:

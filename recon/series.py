@@ -9,16 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.units import warn_of_other_quantity
-from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import JUDGED, JUDGED_SWEEPS, SWEEPS_OF_TURN, OfMoments, learnt_motion, levels, unseen_squares
@@ -38,8 +36,6 @@ _TURN = 4  # sweeps that the steps of a motion take, beside its own
 _FACTORS = 120, 60  # sweeps that factors take: of their trials, beside those of the fit, and of the solution
 SWEEPS = 60
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
-_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the series; for displacements and what they displace
-_COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
 
 
@@ -298,113 +294,3 @@ def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F
     shares /= np.bincount(moment)[:, None]
     past = (at - times[0]) / np.ptp(times)
     return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past
-
-
-@dataclass(frozen=True)
-class TimeSeries:
-    """Volumes at even times of one scan of a sample that changes, see `fit_series`.
-
-    Attributes:
-        volumes: 2 or more, from the first view to the last; each needs twelve views or more.
-        moves: matter moves, and not only its density changes; None: what views held out prefer.
-        sweeps: of the fit.
-        weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
-    """
-
-    name: ClassVar[str] = "series"
-    label: ClassVar[str] = "Volumes in time"
-    traits: ClassVar[Traits] = Traits(in_time=True)
-
-    volumes: int = 2
-    moves: bool | None = None
-    sweeps: int = SWEEPS
-    weight: float | None = None
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        if problem.grid != Grid.matching(problem.geometry):
-            raise ValueError("volumes in time have the grid of the views: leave out another one")
-        n, times = problem.geometry.n_views, problem.use.times
-        times = np.arange(n, dtype=np.float64) if times is None else times
-        history = _History(self.sweeps, n, control)
-        made = fit_series(
-            _measured(problem, times),
-            self.volumes,
-            motion=self.moves,
-            tv_weight=self.weight,
-            sweeps=self.sweeps,
-            seed=problem.seed,
-            go_on=history.heard,
-            stop=control.should_stop or (lambda: False),
-        )
-        series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
-        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
-        settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
-        if made.unseen_residuals is not None:
-            settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
-        if not history.of_sweeps:  # it was stopped before
-            history.tell(0, made.residual)
-        return Reconstruction(Volume(series.data[0], made.grid), settings, history.of_sweeps, series=series)
-
-    def toy(self) -> Self:
-        return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
-
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
-        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * rays
-
-
-@dataclass
-class _History:
-    """Progress of a series: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
-
-    sweeps: int
-    n_views: int
-    control: RunControl
-    of_sweeps: tuple[Progress, ...] = ()
-    tried: int = 0
-
-    def __post_init__(self) -> None:
-        self.began = self.control.now()
-
-    def heard(self, sweep: int, residual: float) -> bool:
-        """As `fit_series` calls its `go_on`."""
-        if sweep > 0:
-            self.tell(sweep, residual)
-        else:
-            self.tried += 1
-            self._tell(
-                Progress(self.tried, self.tried - sweep, math.nan, math.nan, math.nan, 0, 0, unit="trial sweeps")
-            )
-            self.tried = 0 if sweep == 0 else self.tried
-        return self.control.should_stop is None or not self.control.should_stop()
-
-    def tell(self, sweep: int, residual: float) -> None:
-        """Of a sweep of the fit."""
-        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
-
-    def _tell(self, reached: Progress) -> Progress:
-        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        if self.control.on_progress is not None:
-            self.control.on_progress(now)
-        return now
-
-
-def _measured(problem: ReconProblem, times: F64) -> TimedViews:
-    """The views, 0 and without weight where nothing was measured."""
-    data, weights = problem.projections, problem.use.weights
-    if not (finite := np.isfinite(data)).all():
-        weights = finite.astype(np.float32) if weights is None else weights * finite
-    if weights is not None:
-        data = np.where(weights > 0, data, np.float32(0))
-    return TimedViews(data, problem.geometry, times, weights)
-
-
-def _because(still: float, moved: float, moves: bool) -> str:
-    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
-    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
-    if moves or moved >= still:
-        return f"{'motion' if moves else 'no motion'}, as {judged}"
-    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"

@@ -14,9 +14,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
+from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
+from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS
 from recon.voxels.held_out import ONE_IN, busiest_rows, slab_of
 
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
@@ -28,6 +31,7 @@ _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
 _FIRST_HEAVIER = 3  # likewise, then of a heavier one for the first component
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
+MATERIAL_SWEEPS = 20
 TRIAL_SWEEPS = (_TRIALS + _HEAVIER + _FIRST_HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
 
 
@@ -63,7 +67,7 @@ def fit_materials(
     grid: Grid | None = None,
     *,
     tv_weight: float | None = None,
-    sweeps: int = 20,
+    sweeps: int = MATERIAL_SWEEPS,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
     stop: Callable[[], bool] = lambda: False,
@@ -95,6 +99,20 @@ def fit_materials(
     fit = EnergyFit(views, grid, np.random.default_rng(seed), stop=stop)
     densities, residual = fitted(fit, weights, sweeps, go_on)
     return Materials(densities, grid, weights, residual)
+
+
+def material_costs(geometry: Geometry, materials: int, states: bool, sweeps: int = MATERIAL_SWEEPS) -> Costs:
+    """The work of `fit_materials`, and of `fit_share` where two of the materials are states of one."""
+    grid = Grid.matching(geometry)
+    voxels = math.prod(grid.shape)
+    few = min(grid.shape[0], _ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
+
+    def swept(sweeps: float, share: float = 1.0) -> Work:
+        views = sweeps * geometry.n_views
+        return Work.of(f"series, energies {materials}", views, views * share * voxels)
+
+    share = swept(SOLUTION_STEPS) + swept(TRIAL_STEPS, few) if states else Work()  # a step: about a sweep
+    return Costs({"materials": swept(sweeps) + share}, swept(TRIAL_SWEEPS, few))
 
 
 def weight_of(light: F32) -> F32:

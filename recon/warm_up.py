@@ -22,7 +22,7 @@ from recon.voxels.fbp import is_gridded
 from recon.voxels.view_weights import cone_weights, missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
-_IN_TIME = 12  # times these views, for methods of volumes in time
+_SEVERAL = 12  # times these views, for methods of several volumes
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
 
 
@@ -52,7 +52,7 @@ def warm_up(
     method = method or by_name(DEFAULT)()
     if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
         cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry, _IN_TIME if method.traits.in_time else 1)
+    data, views = toy_of(geometry, _SEVERAL if method.traits.several else 1)
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)

@@ -62,10 +62,9 @@ class Grey:
 import numpy as np
 import recon
 from click.testing import CliRunner
-from beamline.cli.method_options import takers
-from beamline.cli.options import Owner
 from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
+from beamline.reconstruct.option_rules import RULES, takers
 from beamline.reconstruct.outcome import label_of
 from beamline.trials.figures import pareto_plot
 from beamline.trials.plans import plan
@@ -82,7 +81,7 @@ assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in takers(Owner("iterations")) and "grey" not in takers(Owner("tv_weight"))
+assert "grey" in takers(RULES["iterations"]) and "grey" not in takers(RULES["tv-weight"])
 assert label_of("grey") == "Grey"
 """,
 )

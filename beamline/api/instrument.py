@@ -16,8 +16,7 @@ from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
 from beamline.core.run_result import RunResult
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import printable
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of

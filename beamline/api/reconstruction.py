@@ -15,7 +15,7 @@ from beamline.api.instrument import Say, to_stderr
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
-from beamline.core.signals import StopOnSignal
+from beamline.core.stop import StopOnSignal
 from beamline.projections.selection import Selection
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions

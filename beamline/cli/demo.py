@@ -21,9 +21,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
 from beamline.core.narration import sentence
 from beamline.core.process import ChildProcess
-from beamline.core.signals import stop_signals
 from beamline.core.sinks import fan_out
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import click
 
 from beamline.cli.options import json_events, set_option
 from beamline.core.events import Diagnosed, Done
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from beamline.doctor.check import Grade
 from drivers.base.clock import SystemClock
 

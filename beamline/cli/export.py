@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, json_option, parsed, refuse_shared, volume_argument, volume_path
+from beamline.cli.options import (
+    json_events,
+    json_option,
+    parsed,
+    refuse_shared,
+    set_by,
+    volume_argument,
+    volume_path,
+    with_request,
+)
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock
@@ -40,39 +50,44 @@ def _output_path(text: str) -> Path:
     return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)
 
 
+@dataclass(frozen=True, eq=False)
+class ExportRequest:
+    """What `beamline export` is asked for."""
+
+    volume: Path = set_by(volume_argument)
+    output: Path = set_by(
+        "-o",
+        "--output",
+        metavar="PATH",
+        callback=parsed(_output_path),
+        required=True,
+        help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
+    )
+    bits: str = set_by(
+        "--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values."
+    )
+    window: tuple[float, float] | None = set_by(
+        "--window",
+        metavar="LOW:HIGH",
+        callback=parsed(window_of),
+        help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
+    )
+    gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
+    poses: bool = set_by(
+        "--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads."
+    )
+    at: int | None = set_by(
+        "--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
+    )
+    dataset: str | None = set_by(
+        "--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes."
+    )
+    as_json: bool = set_by(json_option)
+
+
 @click.command()
-@volume_argument
-@click.option(
-    "-o",
-    "--output",
-    metavar="PATH",
-    callback=parsed(_output_path),
-    required=True,
-    help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
-)
-@click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
-@click.option(
-    "--window",
-    metavar="LOW:HIGH",
-    callback=parsed(window_of),
-    help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
-)
-@click.option("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
-@click.option("--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads.")
-@click.option("--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on.")
-@click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
-@json_option
-def export(
-    volume: Path,
-    output: Path,
-    bits: str,
-    window: tuple[float, float] | None,
-    gaussians: bool,
-    poses: bool,
-    at: int | None,
-    dataset: str | None,
-    as_json: bool,
-) -> None:
+@with_request(ExportRequest)
+def export(request: ExportRequest) -> None:
     """Copy VOLUME to another format.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
@@ -81,47 +96,62 @@ def export(
     from beamline.storage.volumes.base import Pixels
     from beamline.storage.volumes.files import format_of, opened_volume, write_volume
 
-    refuse_shared({"VOLUME": volume, "--output": output})
-    parts = {"--gaussians": (gaussians, _PLY, _export_gaussians), "--poses": (poses, _CSV, _export_poses)}
+    refuse_shared({"VOLUME": request.volume, "--output": request.output})
+    parts = {
+        "--gaussians": (request.gaussians, _PLY, _export_gaussians),
+        "--poses": (request.poses, _CSV, _export_poses),
+    }
     for name, (wanted, suffix, _) in parts.items():
-        if (output.suffix.lower() == suffix) != wanted:
-            raise click.UsageError(f"-o {output}: {name} goes with the suffix {suffix}, and voxels with another.")
+        if (request.output.suffix.lower() == suffix) != wanted:
+            raise click.UsageError(
+                f"-o {request.output}: {name} goes with the suffix {suffix}, and voxels with another."
+            )
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
-            if window is not None or bits != "32" or dataset is not None or at is not None:
+            if request.bits != "32" or any(x is not None for x in (request.window, request.dataset, request.at)):
                 raise click.UsageError(f"{name} does not go with --bits, --window, --at or --dataset.")
-            export_part(volume, output, as_json)
+            export_part(request.volume, request.output, request.as_json)
             return
-    if dataset is not None and at is not None:
+    if request.dataset is not None and request.at is not None:
         raise click.UsageError("--at does not go with --dataset: a series in time has one array.")
-    pixels = Pixels(int(bits), window)
-    if pixels.bits == 32 and window is not None:
+    pixels = Pixels(int(request.bits), request.window)
+    if pixels.bits == 32 and request.window is not None:
         raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
-    if pixels.bits < 32 and not format_of(output).greys:
-        raise click.UsageError(f"{format_of(output).name} holds the values themselves: leave out --bits and --window.")
+    if pixels.bits < 32 and not format_of(request.output).greys:
+        raise click.UsageError(
+            f"{format_of(request.output).name} holds the values themselves: leave out --bits and --window."
+        )
     clock = SystemClock()
     began = clock.now()
-    with terminated_like_interrupted(), json_events(as_json) as sink:
-        refuse_existing(output)
-        with opened_volume(volume, dataset, at) as record:
+    with terminated_like_interrupted(), json_events(request.as_json) as sink:
+        refuse_existing(request.output)
+        with opened_volume(request.volume, request.dataset, request.at) as record:
             if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
                 raise DataError(
-                    f"{volume} holds grey values of a window, not the volume itself. Export the volume it was made of."
+                    f"{request.volume} holds grey values of a window, not the volume itself. Export the volume it was "
+                    "made of."
                 )
-            if pixels.bits < 32 and window is None:
-                raise ConfigError(f"--bits {bits} needs --window LOW:HIGH. {_suggestion(record)}")
-            clipped = write_volume(output, record, pixels)
+            if pixels.bits < 32 and request.window is None:
+                raise ConfigError(f"--bits {request.bits} needs --window LOW:HIGH. {_suggestion(record)}")
+            clipped = write_volume(request.output, record, pixels)
             shape = record.volume.grid.shape
         seconds = clock.now() - began
         share = clipped / math.prod(shape)
-        facts = {"output": output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
+        facts = {
+            "output": request.output,
+            "shape": shape,
+            "bits": pixels.bits,
+            "window": request.window,
+            "clipped": share,
+        }
         sink(Done({**facts, "seconds": seconds}, time=clock.now()))
-    if as_json:
+    if request.as_json:
         return
-    click.echo(f"output   {output} ({format_of(output).name}, {pixels.dtype.name})")
+    click.echo(f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})")
     click.echo(f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}")
-    if window is not None:
-        click.echo(f"window   {window[0]:g} to {window[1]:g}; {share:.3%} of the voxels lie outside and are clipped")
+    if request.window is not None:
+        low, high = request.window
+        click.echo(f"window   {low:g} to {high:g}; {share:.3%} of the voxels lie outside and are clipped")
 
 
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:

@@ -15,7 +15,7 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
 from beamline.core.events import Done, RuleBroken
 from beamline.core.files import refuse_existing
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
 from drivers.base.clock import SystemClock

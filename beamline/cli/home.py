@@ -10,7 +10,7 @@ import click
 
 from beamline.cli.options import POSITIVE, config_argument, set_option
 from beamline.core.errors import INTERRUPTED
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from drivers.base.errors import DeviceError
 
 

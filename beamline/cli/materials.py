@@ -14,8 +14,8 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
-from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import Warnings
+from beamline.core.stop import StopOnSignal
 from drivers.base.clock import SystemClock
 
 _FILE = click.Path(path_type=Path, dir_okay=False)

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
-from beamline.cli.options import POSITIVE, Owner, declared, name_of, option, parsed, together
+from beamline.cli.options import POSITIVE, declared, option, parsed, rules_of, run_option, together
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, MODEL_STEPS, Loss, Start
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import DEFAULT, build, by_name, has_setting, names, taking, with_trait
+from recon.methods import DEFAULT, build, by_name, has_setting, names, taking
 
 PRESETS_OF_METHODS = ("published",)
 """Endings of names of methods that are variants of another method, such as r2-published."""
-
-_FINISHED = {"follow": "it is for a finished scan"}
-_BY_BUDGET = {"budget": "--budget chooses it"}
-_PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
-_BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
 
 
 def checkpoint_output(path: Path) -> Path:
@@ -45,14 +40,8 @@ def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | No
 
 def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any]:
     """The settings of methods in the values of a command's parameters, by their paths; takes them out of `values`."""
-    taken = {
-        param.owner: values.pop(name)
-        for name, param in declared(command).items()
-        if param.owner is not None and param.owner.setting
-    }
-    return {
-        owner.setting: not value if owner.inverted else value for owner, value in taken.items() if value is not None
-    }
+    taken = [(param.rule, values.pop(name)) for name, param in declared(command).items() if param.rule.setting]
+    return {rule.setting: not value if rule.inverted else value for rule, value in taken if value is not None}
 
 
 def row_settings(command: click.Command, methods: Sequence[str], values: dict[str, Any]) -> dict[str, dict[str, Plain]]:
@@ -61,7 +50,7 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
     Raises:
         UsageError: an option that no method takes.
     """
-    options = {param.owner.setting: name_of(param) for param in declared(command).values() if param.owner is not None}
+    options = {rule.setting: name for name, rule in rules_of(command).items() if rule.setting}
     settings = settings_of(command, values)
     for path in settings:
         if not set(methods) & set(owners := taking(path)):
@@ -143,23 +132,6 @@ def resumes_slabs(path: Path | None) -> bool:
     return path is not None and is_partial(path)
 
 
-def takers(owner: Owner) -> tuple[str, ...]:
-    """Names of the methods that take an option."""
-    if owner.setting:
-        return taking(owner.setting)
-    from recon.auto import Auto
-
-    return (*((Auto.name,) if getattr(Auto.traits, owner.trait) else ()), *with_trait(owner.trait))
-
-
-def refuse_for_method(ctx: click.Context, method: str, given: Collection[str]) -> None:
-    """Raises UsageError for an option of other methods; `given` are the names of the parameters that the user gave."""
-    for name, param in declared(ctx.command).items():
-        if name not in given or param.owner is None or method in (owners := takers(param.owner)):
-            continue
-        raise click.UsageError(f"--{name_of(param)} is of {', '.join(owners)}; it does not go with --method {method}.")
-
-
 preset_option = option(
     "--preset",
     of_one_call=True,  # it is in the name of the method
@@ -167,79 +139,56 @@ preset_option = option(
     help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
     "The same as the method r2-published.",
 )
-_STEPS = option(
+_STEPS = run_option(
     "--steps",
-    owner=Owner("steps"),
-    excludes={"seconds": "give one of them", **_PLANNED},
     type=click.IntRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
     f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
 )
-_GAUSSIANS = option(
+_GAUSSIANS = run_option(
     "--gaussians",
-    owner=Owner("gaussians"),
-    excludes=_PLANNED,
     type=click.IntRange(min=1),
     help="Number of Gaussians at the start.",
 )
-_FINISH = option(
+_FINISH = run_option(
     "--finish",
-    owner=Owner("finish"),
-    excludes={**_PLANNED, **_FINISHED},
     type=click.IntRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
     "with sparse patches where views held out are predicted better so.",
 )
-_ITERATIONS = option(
+_ITERATIONS = run_option(
     "--iterations",
-    owner=Owner("iterations"),
-    excludes=_BY_BUDGET,
     type=click.IntRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
-_TV_WEIGHT = option(
+_TV_WEIGHT = run_option(
     "--tv-weight",
-    owner=Owner("tv_weight"),
     type=POSITIVE,
     help="Weight of the total variation, relative to the density of the sample.",
 )
-_PATCH_THRESHOLD = option(
+_PATCH_THRESHOLD = run_option(
     "--patch-threshold",
-    owner=Owner("patch_threshold"),
     type=POSITIVE,
     help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
     "Default: as views held out prefer.",
 )
-_ALLOW_NEGATIVE = option(
+_ALLOW_NEGATIVE = run_option(
     "--allow-negative",
-    owner=Owner("allow_negative"),
-    excludes=_FINISHED,
     is_flag=True,
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
 _IN_TIME = together(
-    option(
+    run_option(
         "--time",
         "volumes",
-        owner=Owner("volumes"),
-        excludes={
-            **_FINISHED,
-            "axis_trials": "find the axis first: give --axis try without --time, then its column with --time",
-            "region": "a box is of one volume",
-            "truth": "a truth is compared with one volume",
-            "uncertainty": "error bars are of one volume",
-            "cluster": "volumes in time are not made in slabs",
-        },
         type=click.IntRange(min=2),
         metavar="N",
         help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",
     ),
-    option(
+    run_option(
         "--moves/--no-moves",
-        owner=Owner("moves"),
-        needs=("volumes", "is of volumes in time: give --time N with it."),
         default=None,
         help="With --time: matter moves, or only its density changes. Default: what views held out prefer.",
     ),
@@ -250,7 +199,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("volumes", "spectra"), "it is of methods that make one volume"),
+        **dict.fromkeys(("time", "spectra"), "it is of methods that make one volume"),
     },
     type=POSITIVE,
     metavar="EACH",
@@ -261,87 +210,67 @@ equal_time = option(
 method_options = together(
     heading(METHOD),
     _STEPS,
-    option(
+    run_option(
         "--seconds",
-        owner=Owner("seconds"),
-        excludes=_PLANNED,
         type=POSITIVE,
         help="Time of the whole call, from reading the scan to volume and report, instead of --steps. If it is too "
         "little, a warning says so before the fit. With --follow: of the fit after the end of the scan.",
     ),
-    option(
+    run_option(
         "--budget",
-        owner=Owner(trait="budget"),
-        excludes={"quality": "give one of them", **_BY_SECONDS},
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
         help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
     ),
-    option(
+    run_option(
         "--quality",
-        owner=Owner(trait="presets"),
-        excludes=_BY_SECONDS,
         type=click.Choice(list(PRESETS)),
         help="Preset of steps and Gaussians.",
     ),
     _GAUSSIANS,
-    option(
+    run_option(
         "--start",
-        owner=Owner("start"),
-        excludes={**_BY_BUDGET, **_FINISHED},
         type=click.Choice(get_args(Start)),
         help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
         "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
     ),
-    option(
+    run_option(
         "--loss",
-        owner=Owner("fit.loss"),
-        excludes=_BY_BUDGET,
         type=click.Choice(get_args(Loss)),
         help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
     ),
-    option(
+    run_option(
         "--kernel",
-        owner=Owner("fit.kernel"),
-        excludes=_BY_BUDGET,
         type=click.Choice([kernel.value for kernel in Kernel]),
         help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
     ),
     heading(RESOURCES),
-    option(
+    run_option(
         "--device",
-        owner=Owner(trait="device"),
-        excludes={**_BY_BUDGET, **_FINISHED},
         default="cpu",
         show_default=True,
         metavar="cpu|cuda",
         help="Device of the fit.",
     ),
     heading(METHOD),
-    option(
+    run_option(
         "--early-stop",
-        owner=Owner("early_stop"),
-        excludes={**_BY_BUDGET, **_FINISHED},
         is_flag=True,
         help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
     ),
     _FINISH,
     heading(OUTPUT),
-    option(
+    run_option(
         "--checkpoint",
-        owner=Owner(trait="checkpoints"),
-        excludes={**_BY_BUDGET, **_FINISHED},
         of_one_call=True,
         repeated=False,
         type=click.Path(path_type=Path, dir_okay=False),
         callback=parsed(checkpoint_output),
         help="Write the state of the fit to this file: every minute, at the end, and at Ctrl-C.",
     ),
-    option(
+    run_option(
         "--resume",
-        owner=Owner(trait="checkpoints"),
-        excludes={**_BY_BUDGET, **_FINISHED},
         of_one_call=True,
         callback=checkpoint_input,
         type=click.Path(path_type=Path, dir_okay=False),
@@ -354,10 +283,8 @@ method_options = together(
     _PATCH_THRESHOLD,
     _ALLOW_NEGATIVE,
     _IN_TIME,
-    option(
+    run_option(
         "--plain-splatting",
-        owner=Owner("fit.rays.rectified", inverted=True),
-        excludes=_BY_BUDGET,
         is_flag=True,
         help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It shows the bias that the "
         "corrected projection does not have.",

@@ -2,60 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import json_option, scan_argument, set_option
+from beamline.cli.options import json_option, others, scan_argument, set_by, set_option, with_request
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
-from beamline.core.events import Done, FrameFlagged, Warned
+from beamline.core.events import Done, FrameFlagged, Sink, Warned
 from beamline.core.files import refuse_existing, write_whole
-from beamline.core.signals import StopOnSignal
+from beamline.core.stop import StopOnSignal
 from beamline.core.text import spans
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
-    from beamline.monitor.check import Level
+    from beamline.monitor.check import Check, Level
+    from beamline.monitor.references import ReferenceLimits
     from beamline.projections.replay import Judged, Kind, ScanVerdict
     from beamline.projections.returned import ReturnedView
 
 
+@dataclass(frozen=True, eq=False)
+class MonitorRequest:
+    """What `beamline monitor` is asked for."""
+
+    file: Path = set_by(scan_argument)
+    follow: bool = set_by("--follow", is_flag=True, help="Follow a scan that is still running.")
+    config: Path | None = set_by(
+        "--config",
+        type=click.Path(path_type=Path),
+        help="Configuration whose sections `monitor` and `references` give the limits. Default: those of a new scan.",
+    )
+    overrides: tuple[str, ...] = set_by(set_option)
+    sheet: Path | None = set_by(
+        "--sheet",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
+    )
+    volume: Path | None = set_by(
+        "--volume",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="Compare each view with the render of this volume, which `beamline recon` made of all rows of FILE.",
+    )
+    values: Mapping[str, Any] = others(scan_options)
+    as_json: bool = set_by(json_option)
+
+
 @click.command()
-@scan_argument
-@click.option("--follow", is_flag=True, help="Follow a scan that is still running.")
-@click.option(
-    "--config",
-    type=click.Path(path_type=Path),
-    help="Configuration whose sections `monitor` and `references` give the limits. Default: those of a new scan.",
-)
-@set_option
-@click.option(
-    "--sheet",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Write a picture of the worst frames with the regions of their flags to this new PNG file.",
-)
-@click.option(
-    "--volume",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Compare each view with the render of this volume, which `beamline recon` made of all rows of FILE.",
-)
-@scan_options
-@json_option
-def monitor(
-    file: Path,
-    follow: bool,
-    config: Path | None,
-    overrides: tuple[str, ...],
-    sheet: Path | None,
-    volume: Path | None,
-    as_json: bool,
-    **scan_facts: Any,
-) -> None:
+@with_request(MonitorRequest)
+def monitor(request: MonitorRequest) -> None:
     """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.
 
     Prints the flags by check and level: frames, worst score, limit, where in the frame, what to do; and which checks
@@ -66,66 +65,91 @@ def monitor(
     from beamline.config.load import load
     from beamline.config.monitor import configured_checks, reference_limits
     from beamline.monitor.checks import CHECKS
-    from beamline.projections.flagged_frames import worst_frames
-    from beamline.projections.replay import replay, verdict
-    from beamline.projections.returned import returned_views
-    from beamline.storage.flag_legend import FrameFlags, counted
-    from beamline.storage.readers.open import SourceOptions
-    from beamline.storage.rules.validate import scan_ended
+    from beamline.storage.flag_legend import counted
 
-    if overrides and config is None:
+    if request.overrides and request.config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
-    if sheet is not None:
-        refuse_existing(sheet)
+    if request.sheet is not None:
+        refuse_existing(request.sheet)
     clock = SystemClock()
-    with events_shown(as_json) as sink:
+    with events_shown(request.as_json) as sink:
         checks, limits = CHECKS, None
-        if config is not None:
-            read = load(config, overrides)
+        if request.config is not None:
+            read = load(request.config, request.overrides)
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
-        progress = counting("monitor", sink, clock)
-        frames: list[Judged] = []
-        active: set[tuple[str, Level]] = set()
-        with SourceOptions(file, **scan_facts).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
-            model = None
-            if volume is not None:
-                from beamline.projections.rendered import rendered  # loads numba
-
-                model = rendered(volume, source)
-            for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
-                frames.append(judged)
-                if not follow:
-                    progress(len(frames), judged.n)
-                now = {(flag.check, flag.level) for flag in judged.flags}
-                for flag in judged.flags:
-                    if (flag.check, flag.level) not in active:
-                        sink(FrameFlagged(flag, time=clock.now()))
-                active = now
-            summed = verdict(source, frames, limits)
-            returned = [] if stopped() else returned_views(source)
-            ended = [finding.message for finding in scan_ended(source)]
-            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in frames]))):
-                from beamline.report.contact_sheet import contact_sheet
-
-                write_whole(sheet, contact_sheet(worst))
+        watched = _watched(request, checks, limits, sink, clock)
+        summed, returned = watched.verdict, watched.returned
         altered = [summed.altered] if summed.altered else []
-        for fault in [*summed.references, *altered, *ended]:
+        for fault in [*summed.references, *altered, *watched.ended]:
             sink(Warned(fault, time=clock.now()))
-        sink(Done(_facts(file, summed, returned), time=clock.now()))
+        sink(Done(_facts(request.file, summed, returned), time=clock.now()))
     n, alarmed, references = summed.n_frames, summed.alarmed, summed.references
-    if not as_json:
-        end = f"{file}: {n} frames, flagged: {counted(summed.flags)}"
+    if not request.as_json:
+        end = f"{request.file}: {n} frames, flagged: {counted(summed.flags)}"
         if again := summed.retaken:
             end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
         back = [f"On the way back: {view.said()}." for view in returned]
         drift = [summed.drift] if summed.drift else []
-        click.echo("\n".join([*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *ended, end]))
-    if stopped():
-        raise ScanStopped(f"{file}: stopped after {n} frames.")
+        lines = [*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *watched.ended, end]
+        click.echo("\n".join(lines))
+    if watched.stopped:
+        raise ScanStopped(f"{request.file}: stopped after {n} frames.")
     if alarmed or references:
         faults = f", and groups of references with a fault: {len(references)}" if references else ""
-        raise AlarmError(f"{file}: {len(alarmed)} of {n} frames have an alarm{faults}; stdout lists them.")
+        raise AlarmError(f"{request.file}: {len(alarmed)} of {n} frames have an alarm{faults}; stdout lists them.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Watched:
+    """A scan that the checks have looked at: the verdict, its views on the way back, how it ended, and a stop."""
+
+    verdict: ScanVerdict
+    returned: Sequence[ReturnedView]
+    ended: Sequence[str]
+    stopped: bool
+
+
+def _watched(
+    request: MonitorRequest, checks: Sequence[Check], limits: ReferenceLimits | None, sink: Sink, clock: Clock
+) -> _Watched:
+    """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
+    from beamline.projections.flagged_frames import worst_frames
+    from beamline.projections.replay import replay, verdict
+    from beamline.projections.returned import returned_views
+    from beamline.storage.flag_legend import FrameFlags
+    from beamline.storage.readers.open import SourceOptions
+    from beamline.storage.rules.validate import scan_ended
+
+    progress, follow = counting("monitor", sink, clock), clock if request.follow else None
+    frames: list[Judged] = []
+    active: set[tuple[str, Level]] = set()
+    stopping, opened = StopOnSignal("Stopping."), SourceOptions(request.file, **request.values)
+    with opened.open(follow=request.follow) as source, stopping() as stopped:
+        model = None
+        if request.volume is not None:
+            from beamline.projections.rendered import rendered  # loads numba
+
+            model = rendered(request.volume, source)
+        for judged in replay(source, checks, model=model, follow=follow, should_stop=stopped):
+            frames.append(judged)
+            if not request.follow:
+                progress(len(frames), judged.n)
+            now = {(flag.check, flag.level) for flag in judged.flags}
+            for flag in judged.flags:
+                if (flag.check, flag.level) not in active:
+                    sink(FrameFlagged(flag, time=clock.now()))
+            active = now
+        summed = verdict(source, frames, limits)
+        returned = [] if stopped() else returned_views(source)
+        ended = [finding.message for finding in scan_ended(source)]
+        if request.sheet is not None:
+            worst = worst_frames(source, FrameFlags.of_flags([judged.flags for judged in frames]))
+            if worst:
+                from beamline.report.contact_sheet import contact_sheet
+
+                write_whole(request.sheet, contact_sheet(worst))
+        return _Watched(summed, returned, ended, stopped())
 
 
 def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) -> dict[str, Any]:

@@ -6,10 +6,11 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import field, fields
 from datetime import datetime
+from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,6 +21,7 @@ from click.exceptions import ClickException, Exit
 from beamline.core.errors import DataError, exit_code, user_message
 from beamline.core.events import Event, Failed, Sink
 from beamline.core.sinks import JsonLines, fan_out
+from beamline.reconstruct.option_rules import RULES, OptionRule, contradiction
 from drivers.base.clock import SystemClock
 
 
@@ -44,28 +46,11 @@ SEED = click.IntRange(min=0)
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
-@dataclass(frozen=True)
-class Owner:
-    """The methods that take an option.
-
-    Attributes:
-        setting: those with this setting, by its path in Python, such as `fit.loss`.
-        trait: those with this trait, where the option is no setting.
-        inverted: the option is a flag that switches the setting off.
-    """
-
-    setting: str = ""
-    trait: str = ""
-    inverted: bool = False
-
-
 class Declared(click.Option):
     """An option that states, once and here, all that commands ask about it.
 
     Args:
-        owner: the methods that take it; None: it is not a method's.
-        excludes: what does not go with it, by parameter name, and why.
-        needs: another parameter, without which this one means nothing, and the end of the sentence that says so.
+        rule: whose it is, and what it goes with; `excludes` and `needs` make one.
         of_one_call: it is of one scan or call, and never part of a recipe.
         repeated: the command line that repeats a call has it, too.
     """
@@ -73,7 +58,7 @@ class Declared(click.Option):
     def __init__(
         self,
         *args: Any,
-        owner: Owner | None = None,
+        rule: OptionRule | None = None,
         excludes: Mapping[str, str] | None = None,
         needs: tuple[str, str] | None = None,
         of_one_call: bool = False,
@@ -81,13 +66,18 @@ class Declared(click.Option):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.owner, self.excludes, self.needs = owner, dict(excludes or {}), needs
+        self.rule = rule or OptionRule(excludes=dict(excludes or {}), needs=needs)
         self.of_one_call, self.repeated = of_one_call, repeated
 
 
 def option(*names: str, **facts: Any) -> Decorator:
     """`click.option` for a `Declared` one."""
     return click.option(*names, cls=Declared, **facts)
+
+
+def run_option(name: str, *names: str, **facts: Any) -> Decorator:
+    """An option of a reconstruction, whose rule `beamline.reconstruct.option_rules` has by this long name."""
+    return option(name, *names, rule=RULES[name.split("/")[0].lstrip("-")], **facts)
 
 
 def name_of(option: click.Option) -> str:
@@ -100,24 +90,22 @@ def declared(command: click.Command) -> dict[str, Declared]:
     return {param.name: param for param in command.params if isinstance(param, Declared) and param.name}
 
 
+def rules_of(command: click.Command) -> dict[str, OptionRule]:
+    """The rules of a command's options, by their long names."""
+    return {name_of(param): param.rule for param in declared(command).values()}
+
+
 def refuse_contradictions(
     command: click.Command, given: Collection[str], shown: Mapping[str, str] = MappingProxyType({})
 ) -> None:
     """Raises UsageError for two options that do not go together, or one without another that it needs.
 
     Args:
-        given: names of the parameters that the user gave, and of what else options may exclude.
+        given: long names of the options that the user gave, and of what else options may exclude.
         shown: how messages name the latter.
     """
-    options = declared(command)
-    texts = {name: f"--{name_of(param)}" for name, param in options.items()} | dict(shown)
-    for name in [name for name in options if name in given]:
-        for other, why in options[name].excludes.items():
-            if other in given:
-                raise click.UsageError(f"{texts[name]} does not go with {texts[other]}: {why}. Nothing was computed.")
-        needs = options[name].needs
-        if needs is not None and needs[0] not in given:
-            raise click.UsageError(f"{texts[name]} {needs[1]}")
+    if why := contradiction(rules_of(command), given, shown):
+        raise click.UsageError(why)
 
 
 config_argument = click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
@@ -152,6 +140,50 @@ def together(*options: Decorator) -> Decorator:
         return command
 
     return add
+
+
+def set_by(*options: Decorator | str, **facts: Any) -> Any:
+    """A field of a command's request, and the option that sets it.
+
+    Args:
+        options: names of the option, or an option or argument whose parameter is named as the field; after headings.
+        facts: as of `option`, beside names.
+    """
+    return field(metadata={"options": options, "facts": facts})
+
+
+def others(*options: Decorator) -> Any:
+    """The field of a request that has the values of these options, which are no fields, by parameter name."""
+    return field(metadata={"options": options})
+
+
+def with_request(request: type) -> Decorator:
+    """A decorator that adds the options of a request's fields, in their order, and calls the command with the request.
+
+    Args:
+        request: a frozen dataclass whose fields are made by `set_by`, and one of them perhaps by `others`.
+    """
+    fields_of = {each.name: each.metadata for each in fields(request)}
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def call(**values: Any) -> Any:
+            own = {name: values.pop(name) for name, made in fields_of.items() if "facts" in made}
+            return command(request(**own, **{name: values for name in fields_of if name not in own}))
+
+        return together(*(each for name, made in fields_of.items() for each in _options_of(name, **made)))(call)
+
+    return add
+
+
+def _options_of(
+    field: str, options: Sequence[Decorator | str], facts: Mapping[str, Any] | None = None
+) -> list[Decorator]:
+    """The headings and the option of a field."""
+    names = [each for each in options if isinstance(each, str)]
+    return [each for each in options if not isinstance(each, str)] + (
+        [option(*names, field, **(facts or {}))] if names else []
+    )
 
 
 def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:

@@ -53,8 +53,8 @@ def given(ctx: click.Context) -> dict[click.Option, Any]:
 
 
 def names_given(ctx: click.Context) -> set[str]:
-    """The parameter names of the options that the user gave."""
-    return {str(option.name) for option in given(ctx)}
+    """The long names of the options that the user gave."""
+    return {name_of(option) for option in given(ctx)}
 
 
 def _is_of_one_call(option: click.Option) -> bool:

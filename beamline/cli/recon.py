@@ -13,17 +13,16 @@ from beamline.cli.log import LogLines, logged
 from beamline.cli.method_options import (
     method_with,
     preset_of,
-    refuse_for_method,
     resumes_slabs,
     settings_of,
 )
 from beamline.cli.option_groups import Grouped
 from beamline.cli.options import (
-    declared,
     json_events,
     refuse_contradictions,
     refuse_shared,
     require_there,
+    rules_of,
 )
 from beamline.cli.recipe import names_given, recipe_text, repeating
 from beamline.cli.recon_options import SHEET, recon_options
@@ -33,8 +32,9 @@ from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
-from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal
+from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
@@ -42,13 +42,6 @@ from recon.methods import DEFAULT, IN_TIME
 if TYPE_CHECKING:
     from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
-
-
-_AS_NAMED = (
-    "budget", "quality", "device", "filter", "seed", "truth", "unfinished", "memory", "region", "cluster",
-    "uncertainty",
-)  # fmt: skip
-"""Options that are fields of `ReconOptions` by the same names."""
 
 
 @click.command(
@@ -103,17 +96,18 @@ def _checked_method(context: click.Context, method: str | None, axes: AxisRange 
     Raises:
         UsageError: they do not.
     """
-    asked = names_given(context) | ({"axis_trials"} if axes is not None else set())
+    asked, rules = names_given(context) | ({AXIS_TRIALS} if axes is not None else set()), rules_of(context.command)
     if slabs is not None:
-        asked = asked - {"resume"} | {"slabs"}
+        asked = asked - {"resume"} | {SLABS}
     values = context.params
     method = preset_of(method, values["preset"])
     if method is None:
-        of_a_method = {name for name, each in declared(context.command).items() if each.owner is not None}
+        of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
-        method = IN_TIME if "volumes" in asked else DEFAULT if of_fits else AUTO
-    refuse_contradictions(context.command, asked, {"axis_trials": "--axis try", "slabs": f"--resume {slabs}"})
-    refuse_for_method(context, method, asked)
+        method = IN_TIME if "time" in asked else DEFAULT if of_fits else AUTO
+    refuse_contradictions(context.command, asked, {SLABS: f"--resume {slabs}"})
+    if why := of_other_methods(rules, asked, method):
+        raise click.UsageError(why)
     for step in chosen_steps(values) if values["follow"] else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
@@ -152,7 +146,9 @@ def _options(context: click.Context, file: Path, method: str, path: Path, values
         partial=partial,
         command=repeating(context, file, path, () if partial is None else ("resume",)),
         recipe=recipe_text(context, method),
-        **{name: values[name] for name in _AS_NAMED},
+        filter=values["filter"],
+        seed=values["seed"],
+        **{rule.value: values[rule.value] for rule in RULES.values() if rule.value in values},
     )
 
 
@@ -163,7 +159,7 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
         as it should be.
     """
-    reconstruct: Callable[..., dict[str, float]]
+    reconstruct: Callable[..., Mapping[str, float]]
     if values["follow"]:  # each loads what only it needs
         from beamline.reconstruct.follow import follow
 
@@ -172,6 +168,7 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         from beamline.reconstruct.offline import reconstruct_file
 
         reconstruct = reconstruct_file
+
     last: list[Event] = []
     stop = StopOnSignal(ready=values["follow"] or options.budget is not None)
 

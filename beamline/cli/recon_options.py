@@ -17,6 +17,7 @@ from beamline.cli.options import (
     json_option,
     option,
     parsed,
+    run_option,
     scan_argument,
     together,
     volume_path,
@@ -62,10 +63,6 @@ def region_of(text: str) -> Region:
     return Region.parse(text)
 
 
-_RUNNING = ("follow", "is for a scan that still runs: give --follow.")
-_IN_MEMORY = dict.fromkeys(("follow", "budget"), "it holds everything in memory")
-_PICTURE = {"axis_trials": "that writes a picture of slices, and nothing else"}
-
 recon_options = together(
     heading(DATA),
     config_option,
@@ -100,16 +97,13 @@ recon_options = together(
     heading(METHOD),
     option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."),
     heading(OUTPUT),
-    option(
+    run_option(
         "--uncertainty",
-        excludes=dict.fromkeys(
-            ("follow", "budget", "seconds", "axis_trials"), "refits need the whole scan, and time of their own"
-        ),
         is_flag=True,
         help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv "
         "and fbp, into an .h5.",
     ),
-    option(
+    run_option(
         "--truth",
         of_one_call=True,
         metavar="FILE[:A:B]",
@@ -132,54 +126,48 @@ recon_options = together(
         help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
     ),
     heading(DATA),
-    option(
+    run_option(
         "--follow",
-        excludes={"slabs": "these slabs are of a finished scan", "axis_trials": "they need all views"},
         of_one_call=True,
         is_flag=True,
         help="Follow a running scan: reconstruct while its file grows.",
     ),
-    option(
+    run_option(
         "--earlier",
-        needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts."),
         of_one_call=True,
         type=click.Path(path_type=Path),
         multiple=True,
         metavar="FILE",
         help="With --follow, of a run that goes on: an earlier part of it, whose views come first. May be repeated.",
     ),
-    option(
+    run_option(
         "--enough-loss",
-        needs=_RUNNING,
         type=POSITIVE,
         metavar="DB",
         help="With --follow: say when the views to come would add at most so many dB of PSNR.",
     ),
-    option(
+    run_option(
         "--enough-gain",
-        needs=_RUNNING,
         type=POSITIVE,
         metavar="DB",
         help="With --follow: say when ten more views would add at most so many.",
     ),
-    option(
+    run_option(
         "--unfinished",
         of_one_call=True,
         is_flag=True,
         help="Accept an unfinished scan, one that failed or still runs, and use its frames.",
     ),
     heading(RESOURCES),
-    option(
+    run_option(
         "--memory",
-        excludes=_IN_MEMORY,
         metavar="SIZE",
         callback=parsed(memory_size),
         help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
         "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
     ),
-    option(
+    run_option(
         "--cluster",
-        excludes=_IN_MEMORY,
         of_one_call=True,
         metavar="local:N|tcp://HOST:PORT|slurm[:CONFIG]",
         callback=parsed(cluster_of),
@@ -187,14 +175,9 @@ recon_options = together(
         "those of a scheduler, or jobs of Slurm by a YAML file.",
     ),
     heading(OUTPUT),
-    option(
+    run_option(
         "--roi",
         "region",
-        excludes={
-            "follow": "it is for a finished scan",
-            "truth": "a truth is compared with the whole volume",
-            "axis_trials": "they draw whole slices",
-        },
         metavar="Z0:Z1,Y0:Y1,X0:X1",
         callback=parsed(region_of),
         help="Box of voxels to write, of the volume that the same options give without this one. It is made of the "
@@ -208,9 +191,8 @@ recon_options = together(
         help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
         "done.",
     ),
-    option(
+    run_option(
         "--log",
-        excludes=_PICTURE,
         of_one_call=True,
         repeated=False,
         type=click.Path(path_type=Path),
@@ -225,10 +207,9 @@ recon_options = together(
         help="Print everything that happens, with its time, to stderr.",
     ),
     heading(RESOURCES),
-    option(
+    run_option(
         "--dry-run",
         "dry",
-        excludes={"follow": "a scan that runs takes its own time", "budget": "it says the time itself", **_PICTURE},
         of_one_call=True,
         repeated=False,
         is_flag=True,

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, json_option, set_option
+from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
 from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Done, Sink
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
@@ -27,50 +27,50 @@ if TYPE_CHECKING:
     from beamline.scan.resume import ResumableRun
 
 
+@dataclass(frozen=True, eq=False)
+class ScanRequest:
+    """What `beamline scan` is asked for."""
+
+    file: Path | None = set_by(
+        click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
+    )
+    dry: bool = set_by(
+        "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
+    )
+    overrides: tuple[str, ...] = set_by(set_option)
+    rehearse: bool = set_by(
+        "--rehearse",
+        is_flag=True,
+        help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices.",
+    )
+    page: bool = set_by("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
+    no_live: bool = set_by("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
+    documents: str | None = set_by(
+        "--documents",
+        metavar="FILE|tcp://HOST:PORT",
+        type=click.Path(dir_okay=False),
+        help="Add the documents of bluesky to FILE, one a line, or send them to a proxy of 0MQ. "
+        'Needs: pip install "splatline[bluesky]".',
+    )
+    as_json: bool = set_by(json_option)
+    output: Path | None = set_by(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="Folder for the folders of runs. Default: storage.folder of CONFIG.",
+    )
+    run: Path | None = set_by(
+        "--resume",
+        metavar="RUN",
+        type=click.Path(path_type=Path, exists=True, file_okay=False),
+        help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own "
+        "configuration.",
+    )
+
+
 @click.command()
-@click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
-)
-@set_option
-@click.option(
-    "--rehearse", is_flag=True, help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices."
-)
-@click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
-@click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
-@click.option(
-    "--documents",
-    metavar="FILE|tcp://HOST:PORT",
-    type=click.Path(dir_okay=False),
-    help="Add the documents of bluesky to FILE, one a line, or send them to a proxy of 0MQ. "
-    'Needs: pip install "splatline[bluesky]".',
-)
-@json_option
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for the folders of runs. Default: storage.folder of CONFIG.",
-)
-@click.option(
-    "--resume",
-    "run",
-    metavar="RUN",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own configuration.",
-)
-def scan(
-    file: Path | None,
-    dry: bool,
-    overrides: tuple[str, ...],
-    rehearse: bool,
-    page: bool,
-    no_live: bool,
-    documents: str | None,
-    as_json: bool,
-    output: Path | None,
-    run: Path | None,
-) -> None:
+@with_request(ScanRequest)
+def scan(request: ScanRequest) -> None:
     """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
 
     With `scan.energies` it is a series: a scan of each energy, in one folder, which --resume takes too.
@@ -82,56 +82,72 @@ def scan(
     but frames have an alarm of the monitor, or darks or flats a fault.
     """
     from beamline.config.load import load
-    from beamline.instrument.operator import ask_operator
-    from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.resume import NotJoined, open_for_resume
-    from beamline.scan.run import run_scan
 
-    if file is None and run is None:
-        raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
-    if run is not None and (output is not None or (overrides and file is None)):
-        raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
-    if rehearse and run is not None:
-        raise click.UsageError("--rehearse begins a run: --resume goes on with its devices, simulated ones, too.")
-    if run is not None and documents is not None:
-        raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
-    with json_events(as_json) as json_sink, ExitStack() as held:
-        config = None if file is None else load(file, overrides, rehearse=rehearse)
-        of_energies = _config_of_energies(config, run, documents)
+    file, run = request.file, request.run
+    _refuse_contradictions(request)
+    with json_events(request.as_json) as json_sink, ExitStack() as held:
+        config = None if file is None else load(file, request.overrides, rehearse=request.rehearse)
+        of_energies = _config_of_energies(config, run, request.documents)
         if of_energies is not None:
-            if not dry:
-                _run_energies(of_energies, output, run, json_sink, page=page, no_live=no_live, as_json=as_json)
+            if not request.dry:
+                _run_energies(of_energies, request, json_sink)
                 return
             run, config = None, of_energies
         try:
             series = None if run is None else held.enter_context(open_for_resume(run, config))
         except NotJoined:
-            if dry or run is None:
+            if request.dry or run is None:
                 raise
-            _join(run, json_sink, as_json)
+            _join(run, json_sink, request.as_json)
             return
         config = series.config if series else config
         assert config is not None
         for sentence in series.left_out if series else ():
             click.echo(f"Warning: {sentence}", err=True)
-        if dry:
-            _dry_run(config, output, series, json_sink, as_json)
+        if request.dry:
+            _dry_run(config, request.output, series, json_sink, request.as_json)
             return
-        stop, how = StopRequest(), commands_of(config, series) if not no_live else Commands()
-        if how.remark:
-            click.echo(how.remark, err=True)
-        with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-            sinks: list[Sink] = [terminal, json_sink, *([beside] if page else [])]
-            if documents is not None:
-                sinks.append(_documents(config, documents, held))
-            result = run_scan(
-                config, series or output, sinks, stop, live=how.live, afterwards=how.afterwards,
-                ask=lambda request: terminal.ask(request, ask_operator),
-            )  # fmt: skip
-    if not as_json:
+        result = _run_one(config, series, request, json_sink, held)
+    if not request.as_json:
         click.echo(_results(result))
     if faults := _faults(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _refuse_contradictions(request: ScanRequest) -> None:
+    """Raises UsageError for options that do not go together."""
+    if request.file is None and request.run is None:
+        raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
+    if request.run is None:
+        return
+    if request.output is not None or (request.overrides and request.file is None):
+        raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+    if request.rehearse:
+        raise click.UsageError("--rehearse begins a run: --resume goes on with its devices, simulated ones, too.")
+    if request.documents is not None:
+        raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
+
+
+def _run_one(
+    config: Config, series: ResumableRun | None, request: ScanRequest, json_sink: Sink, held: ExitStack
+) -> RunResult:
+    """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
+    from beamline.instrument.operator import ask_operator
+    from beamline.scan.live_process import Commands, commands_of
+    from beamline.scan.run import run_scan
+
+    stop, how = StopRequest(), commands_of(config, series) if not request.no_live else Commands()
+    if how.remark:
+        click.echo(how.remark, err=True)
+    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
+        sinks: list[Sink] = [terminal, json_sink, *([beside] if request.page else [])]
+        if request.documents is not None:
+            sinks.append(_documents(config, request.documents, held))
+        return run_scan(
+            config, series or request.output, sinks, stop, live=how.live, afterwards=how.afterwards,
+            ask=lambda question: terminal.ask(question, ask_operator),
+        )  # fmt: skip
 
 
 def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
@@ -154,16 +170,7 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
     return config
 
 
-def _run_energies(
-    config: Config,
-    output: Path | None,
-    run: Path | None,
-    json_sink: Sink,
-    *,
-    page: bool,
-    no_live: bool,
-    as_json: bool,
-) -> None:
+def _run_energies(config: Config, request: ScanRequest, json_sink: Sink) -> None:
     from beamline.instrument.operator import ask_operator
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
@@ -171,13 +178,13 @@ def _run_energies(
     stop = StopRequest()
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
         done = run_energies(
-            config, output, [terminal, json_sink, *([beside] if page else [])], stop,
-            lambda one, rest: Commands() if no_live else commands_of(one, rest),
-            series=run, ask=lambda request: terminal.ask(request, ask_operator),
+            config, request.output, [terminal, json_sink, *([beside] if request.page else [])], stop,
+            lambda one, rest: Commands() if request.no_live else commands_of(one, rest),
+            series=request.run, ask=lambda question: terminal.ask(question, ask_operator),
         )  # fmt: skip
     data = {"folder": done.folder, "scans": [{"energy_kev": energy, "path": path} for energy, path in done.scans]}
     json_sink(Done(data, time=SystemClock().now()))
-    if not as_json:
+    if not request.as_json:
         click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
     if faults := [said for result in done.results for said in _faults(result)]:

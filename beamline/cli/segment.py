@@ -13,7 +13,7 @@ from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done
-from beamline.core.signals import terminated_like_interrupted
+from beamline.core.stop import terminated_like_interrupted
 from drivers.base.clock import SystemClock
 from recon.base.choices import NECK
 

@@ -5,28 +5,27 @@ from __future__ import annotations
 import os
 import sys
 import time
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, json_option, refuse_shared
+from beamline.cli.options import json_events, json_option, refuse_shared, set_by, with_request
 from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import CostExplained, Done, Event, Sink
 from beamline.core.files import refuse_existing, remove, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
-from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
-    from beamline.simulate.emission import EmissionScene
     from beamline.simulate.scene_file import Scan, SceneFile
-    from beamline.simulate.write import SimulatedScan
+    from beamline.simulate.write import EmissionScene, SimulatedScan
 
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
 _VIEWS = click.IntRange(1)
@@ -42,51 +41,55 @@ def _print_effects(ctx: click.Context, param: click.Parameter, wanted: bool) -> 
         ctx.exit()
 
 
+@dataclass(frozen=True, eq=False)
+class SimulateRequest:
+    """What `beamline simulate` is asked for."""
+
+    scene: str = set_by(click.argument("scene", metavar="SCENE"))
+    explains: bool = set_by(
+        click.option(
+            "--effects",
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_effects,
+            help="Print all effects that a scene may name, with their parameters, and end.",
+        ),
+        "--explain",
+        is_flag=True,
+        help="Print the steps of computing a frame, in order, with the time of each.",
+    )
+    views: int | None = set_by(
+        "--frames",
+        type=_VIEWS,
+        metavar="N",
+        help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
+    )
+    out: Path | None = set_by(
+        "-o", "--output", "--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
+    )
+    truth: Path | None = set_by(
+        "--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file."
+    )
+    truth_bin: int | None = set_by(
+        "--truth-bin",
+        type=click.IntRange(min=1),
+        help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 "
+        "voxels.",
+    )
+    picture: Path | None = set_by(
+        "--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out."
+    )
+    seed: int = set_by(
+        "--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers."
+    )
+    overrides: tuple[str, ...] = set_by("--set", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
+    as_json: bool = set_by(json_option)
+
+
 @click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
-@click.argument("scene", metavar="SCENE")
-@click.option(
-    "--effects",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_effects,
-    help="Print all effects that a scene may name, with their parameters, and end.",
-)
-@click.option(
-    "--explain", "explains", is_flag=True, help="Print the steps of computing a frame, in order, with the time of each."
-)
-@click.option(
-    "--frames",
-    "views",
-    type=_VIEWS,
-    metavar="N",
-    help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
-)
-@click.option(
-    "-o", "--output", "--out", "out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
-)
-@click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
-@click.option(
-    "--truth-bin",
-    type=click.IntRange(min=1),
-    help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 voxels.",
-)
-@click.option("--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out.")
-@click.option("--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers.")
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
-@json_option
-def simulate(
-    scene: str,
-    explains: bool,
-    views: int | None,
-    out: Path | None,
-    truth: Path | None,
-    truth_bin: int | None,
-    picture: Path | None,
-    seed: int,
-    overrides: tuple[str, ...],
-    as_json: bool,
-) -> None:
+@with_request(SimulateRequest)
+def simulate(request: SimulateRequest) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
     Only the effects that the scene names are computed. The file has the format of the instrument, which
@@ -100,33 +103,35 @@ def simulate(
     from beamline.simulate.write import check_output
 
     clock = SystemClock()
-    with terminated_like_interrupted(), json_events(as_json) as sink, exposure_errors(scene):
-        if not (explains or out or truth or picture):
+    with terminated_like_interrupted(), json_events(request.as_json) as sink, exposure_errors(request.scene):
+        if not (request.explains or request.out or request.truth or request.picture):
             raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
-        if truth_bin and not truth:
+        if request.truth_bin and not request.truth:
             raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
-        if (emission := open_emission(scene, overrides)) is not None:
-            if explains or truth_bin or picture:
-                raise ConfigError(f"{scene} emits: it takes no --explain, --truth-bin or --picture. Leave them out.")
-            refuse_shared({"--output": out, "--truth": truth})
-            emission = replace(emission, lines=replace(emission.lines, views=views or emission.lines.views))
-            output = _Output(sink, clock, plain=not as_json)
-            output.event(Done(_emission(emission, seed, out, truth, output, sink)))
+        if (emission := open_emission(request.scene, request.overrides)) is not None:
+            if request.explains or request.truth_bin or request.picture:
+                raise ConfigError(
+                    f"{request.scene} emits: it takes no --explain, --truth-bin or --picture. Leave them out."
+                )
+            refuse_shared({"--output": request.out, "--truth": request.truth})
+            emission = replace(emission, lines=replace(emission.lines, views=request.views or emission.lines.views))
+            output = _Output(sink, clock, plain=not request.as_json)
+            output.event(Done(_emission(emission, request.seed, request.out, request.truth, output, sink)))
             return
-        picture = out.with_suffix(".png") if out and not picture else picture
-        _refuse_outputs(out, truth, picture)
-        opened = open_scene(scene, overrides)
-        scan = scan_of(opened, seed, views, clock.now())
-        if out:
-            check_output(scan, out)
-        output = _Output(sink, clock, plain=not as_json)
-        if explains:
+        picture = request.out.with_suffix(".png") if request.out and not request.picture else request.picture
+        _refuse_outputs(request.out, request.truth, picture)
+        opened = open_scene(request.scene, request.overrides)
+        scan = scan_of(opened, request.seed, request.views, clock.now())
+        if request.out:
+            check_output(scan, request.out)
+        output = _Output(sink, clock, plain=not request.as_json)
+        if request.explains:
             _explain(scan, output)
         outputs: dict[str, object] = {}
-        if truth:
-            outputs |= _truth(scan, truth, truth_bin, output)
+        if request.truth:
+            outputs |= _truth(scan, request.truth, request.truth_bin, output)
         try:
-            written = _scan(opened, scan, out, output, sink) if out else None
+            written = _scan(opened, scan, request.out, output, sink) if request.out else None
             if written:
                 outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
             if picture and not (written and written.stopped):
@@ -137,12 +142,12 @@ def simulate(
                 outputs |= {"picture": picture}
                 output("picture", str(picture))
         except Exception:
-            if truth:
-                remove(truth)
+            if request.truth:
+                remove(request.truth)
             raise
         if written and written.stopped:
             raise ScanStopped(
-                f"Stopped after {written.n_frames} of {len(scan)} frames; {out} holds them and is readable."
+                f"Stopped after {written.n_frames} of {len(scan)} frames; {request.out} holds them and is readable."
             )
         output.event(Done(outputs))
 
@@ -211,8 +216,8 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
 def _emission(
     scene: EmissionScene, seed: int, out: Path | None, truth: Path | None, output: _Output, sink: Sink
 ) -> dict[str, object]:
-    from beamline.simulate.emission import emit, write_emission
     from beamline.simulate.truth import truth_of_emission, write_truth
+    from beamline.simulate.write import emit, write_emission
 
     wanted = {"output": out, "truth": truth}
     for path in (path for path in wanted.values() if path):

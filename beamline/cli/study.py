@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, get_args
@@ -10,7 +12,16 @@ import click
 
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
-from beamline.cli.options import SEED, dry_option, json_option, refuse_contradictions, scan_argument
+from beamline.cli.options import (
+    SEED,
+    dry_option,
+    json_option,
+    others,
+    refuse_contradictions,
+    scan_argument,
+    set_by,
+    with_request,
+)
 from beamline.cli.recipe import names_given, repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
@@ -23,73 +34,64 @@ from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_of_one_volume
 
 
+@dataclass(frozen=True, eq=False)
+class StudyRequest:
+    """What `beamline study` is asked for."""
+
+    which: str = set_by(
+        heading(METHOD), click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
+    )
+    file: Path = set_by(scan_argument)
+    methods: tuple[str, ...] = set_by(
+        "-m",
+        "--method",
+        type=click.Choice(names_of_one_volume()),
+        multiple=True,
+        default=(DEFAULT, BASELINE),
+        show_default=True,
+        help="Method of each row; may be repeated.",
+    )
+    truth: str | None = set_by(
+        heading(DATA),
+        "--truth",
+        metavar="FILE[:A:B]",
+        help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use.",
+    )
+    seconds: float | None = set_by(heading(METHOD), equal_time)
+    values: Mapping[str, Any] = others(row_options, light_options, selection_options)
+    ramp: Filter = set_by(
+        heading(METHOD),
+        "--filter",
+        type=click.Choice(get_args(Filter)),
+        default="shepp-logan",
+        show_default=True,
+        help="Filter of the FBP of all views; hann where these are few or noisy.",
+    )
+    draws: int = set_by(
+        "--draws",
+        type=click.IntRange(min=1, max=100),
+        default=3,
+        show_default=True,
+        help="How often the study random draws its views.",
+    )
+    seed: int = set_by("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+    dry: bool = set_by(dry_option)
+    output: Path | None = set_by(
+        heading(OUTPUT),
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="New folder for the results. Default: FILE's stem and the study's name, in this folder.",
+    )
+    as_json: bool = set_by(json_option)
+
+
 @click.command(
     cls=Grouped,
     first=("methods", "truth", "views", "rows", "binning", "seconds", "steps", "iterations", "output", "dry"),
 )
-@heading(METHOD)
-@click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
-@scan_argument
-@click.option(
-    "-m",
-    "--method",
-    "methods",
-    type=click.Choice(names_of_one_volume()),
-    multiple=True,
-    default=(DEFAULT, BASELINE),
-    show_default=True,
-    help="Method of each row; may be repeated.",
-)
-@heading(DATA)
-@click.option(
-    "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
-)
-@row_options
-@equal_time
-@light_options
-@selection_options
-@heading(METHOD)
-@click.option(
-    "--filter",
-    "ramp",
-    type=click.Choice(get_args(Filter)),
-    default="shepp-logan",
-    show_default=True,
-    help="Filter of the FBP of all views; hann where these are few or noisy.",
-)
-@click.option(
-    "--draws",
-    type=click.IntRange(min=1, max=100),
-    default=3,
-    show_default=True,
-    help="How often the study random draws its views.",
-)
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
-@dry_option
-@heading(OUTPUT)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="New folder for the results. Default: FILE's stem and the study's name, in this folder.",
-)
-@json_option
-def study(
-    which: str,
-    file: Path,
-    methods: tuple[str, ...],
-    truth: str | None,
-    photons_per_count: float | None,
-    dose_in: str | None,
-    ramp: Filter,
-    seconds: float | None,
-    draws: int,
-    seed: int,
-    output: Path | None,
-    dry: bool,
-    as_json: bool,
-    **values: Any,
-) -> None:
+@with_request(StudyRequest)
+def study(request: StudyRequest) -> None:
     """Reconstruct the scan in FILE from chosen views, and compare each volume with the FBP of all its views.
 
     fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
@@ -104,30 +106,36 @@ def study(
     from beamline.trials.runner import ComparedScan
     from beamline.trials.study import StudyLayout, StudyOptions, planned_study, run_study
 
-    methods = tuple(dict.fromkeys(methods))
+    methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
     refuse_contradictions(context.command, names_given(context))
-    settings = row_settings(context.command, methods, values)
-    source, selection = chosen(file, seed, values)
-    folder = output or Path(f"{file.stem}_{which}")
+    settings = row_settings(context.command, methods, dict(request.values))
+    source, selection = chosen(request.file, request.seed, request.values)
+    folder = request.output or Path(f"{request.file.stem}_{request.which}")
     options = StudyOptions(
-        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
-        study=STUDIES[which],
+        scan=ComparedScan(
+            source,
+            selection,
+            folder,
+            request.truth,
+            light_asked(request.values["photons_per_count"], request.values["dose_in"]),
+        ),
+        study=STUDIES[request.which],
         methods=methods,
         settings=settings,
-        seconds=seconds,
-        filter=ramp,
-        draws=draws,
-        seed=seed,
-        command=repeating(context, file, folder),
+        seconds=request.seconds,
+        filter=request.ramp,
+        draws=request.draws,
+        seed=request.seed,
+        command=repeating(context, request.file, folder),
     )
-    if dry:
-        print_dry_run(partial(planned_study, options), folder, as_json)
+    if request.dry:
+        print_dry_run(partial(planned_study, options), folder, request.as_json)
         return
-    with events_shown(as_json) as sink:
+    with events_shown(request.as_json) as sink:
         table = run_study(options, sink, SystemClock())
-    if not as_json:
-        click.echo(text(table, StudyLayout(STUDIES[which])))
+    if not request.as_json:
+        click.echo(text(table, StudyLayout(STUDIES[request.which])))
         click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)}"

@@ -12,7 +12,7 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
-from beamline.storage.writers.mesh_file import MESHES, write_mesh
+from beamline.storage.mesh_file import MESHES, write_mesh
 from drivers.base.clock import SystemClock
 
 

@@ -33,8 +33,8 @@ from beamline.core.events import (
 )
 from beamline.core.machine_speed import seconds_left
 from beamline.core.narration import sentence
-from beamline.core.signals import terminated_like_interrupted
 from beamline.core.sinks import Warn, Warnings
+from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock, SystemClock

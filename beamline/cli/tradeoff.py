@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,11 @@ from beamline.cli.options import (
     dry_option,
     json_option,
     names_in,
-    option,
+    others,
     parsed,
     refuse_contradictions,
+    set_by,
+    with_request,
 )
 from beamline.cli.recipe import names_given, repeating
 from beamline.cli.scan_options import light_asked, light_options
@@ -42,6 +46,77 @@ def listed(value: str) -> tuple[str, ...]:
 _OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each energy."
 
 
+@dataclass(frozen=True, eq=False)
+class TradeoffRequest:
+    """What `beamline tradeoff` is asked for."""
+
+    files: tuple[Path, ...] = set_by(
+        heading(DATA),
+        click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
+    )
+    truth: str | None = set_by(
+        "--truth",
+        excludes=dict.fromkeys(
+            ("time", "spectra"), "it is one volume; views in time, or of several energies, show several"
+        ),
+        metavar="FILE[:A:B]",
+        help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
+        "held out.",
+    )
+    values: Mapping[str, Any] = others(light_options, selection_options)
+    volumes: int | None = set_by(
+        heading(METHOD),
+        "--time",
+        excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
+        type=click.IntRange(min=2),
+        metavar="N",
+        help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
+    )
+    spectra: Path | None = set_by(
+        "--spectra",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
+    )
+    states: str = set_by(
+        "--states",
+        needs=("spectra", _OF_MATERIALS),
+        metavar="NAME,NAME",
+        default="",
+        help="With --spectra: two materials that are two states of the same one.",
+    )
+    methods: tuple[str, ...] | None = set_by(
+        "--methods",
+        callback=parsed(listed),
+        metavar="A,B,...",
+        help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
+        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
+        "of an emission also mlem and osem.",
+    )
+    quick: bool = set_by(
+        "--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones."
+    )
+    seconds: float | None = set_by(equal_time)
+    max_seconds: float | None = set_by(
+        heading(RESOURCES),
+        "--max-seconds",
+        type=POSITIVE,
+        help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
+        "would not fit is not begun.",
+    )
+    dry: bool = set_by(dry_option)
+    seed: int = set_by(
+        heading(METHOD), "--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."
+    )
+    output: Path | None = set_by(
+        heading(OUTPUT),
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path, file_okay=False),
+        help="New folder for the results. Default: FILE's stem + _tradeoff, in this folder.",
+    )
+    as_json: bool = set_by(json_option)
+
+
 @click.command(
     cls=Grouped,
     first=(
@@ -57,85 +132,8 @@ _OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each ene
         "dry",
     ),
 )
-@heading(DATA)
-@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@option(
-    "--truth",
-    excludes=dict.fromkeys(
-        ("volumes", "spectra"), "it is one volume; views in time, or of several energies, show several"
-    ),
-    metavar="FILE[:A:B]",
-    help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views held out.",
-)
-@light_options
-@selection_options
-@heading(METHOD)
-@option(
-    "--time",
-    "volumes",
-    excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
-    type=click.IntRange(min=2),
-    metavar="N",
-    help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
-)
-@option(
-    "--spectra",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
-)
-@option(
-    "--states",
-    needs=("spectra", _OF_MATERIALS),
-    metavar="NAME,NAME",
-    default="",
-    help="With --spectra: two materials that are two states of the same one.",
-)
-@click.option(
-    "--methods",
-    callback=parsed(listed),
-    metavar="A,B,...",
-    help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
-    f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
-    "of an emission also mlem and osem.",
-)
-@click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
-@equal_time
-@heading(RESOURCES)
-@click.option(
-    "--max-seconds",
-    type=POSITIVE,
-    help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
-    "would not fit is not begun.",
-)
-@dry_option
-@heading(METHOD)
-@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
-@heading(OUTPUT)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="New folder for the results. Default: FILE's stem + _tradeoff, in this folder.",
-)
-@json_option
-def tradeoff(
-    files: tuple[Path, ...],
-    truth: str | None,
-    photons_per_count: float | None,
-    dose_in: str | None,
-    volumes: int | None,
-    spectra: Path | None,
-    states: str,
-    methods: tuple[str, ...] | None,
-    quick: bool,
-    seconds: float | None,
-    max_seconds: float | None,
-    seed: int,
-    output: Path | None,
-    dry: bool,
-    as_json: bool,
-    **values: Any,
-) -> None:
+@with_request(TradeoffRequest)
+def tradeoff(request: TradeoffRequest) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
     With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
@@ -153,31 +151,37 @@ def tradeoff(
     from beamline.trials.runner import ComparedScan
     from beamline.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
 
-    context = click.get_current_context()
+    context, files = click.get_current_context(), request.files
     refuse_contradictions(context.command, names_given(context))
-    if spectra is None and len(files) > 1:
+    if request.spectra is None and len(files) > 1:
         raise click.UsageError(f"A comparison of {len(files)} files {_OF_MATERIALS}")
-    folder = output or Path(f"{files[0].stem}_tradeoff")
-    with events_shown(as_json) as sink:
-        if spectra is not None:
+    folder = request.output or Path(f"{files[0].stem}_tradeoff")
+    with events_shown(request.as_json) as sink:
+        if request.spectra is not None:
             files = scans_of(files, Warnings(sink, SystemClock()))
-        (source, selection), *others = (chosen(path, seed, values) for path in files)
+        (source, selection), *further = (chosen(path, request.seed, request.values) for path in files)
         options = TradeoffOptions(
-            scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
-            methods=methods or (),
-            several=SeveralVolumes(volumes or 0, others, spectra, names_in(states)),
-            depth="quick" if quick else "full",
-            max_seconds=max_seconds,
-            seconds=seconds,
-            seed=seed,
+            scan=ComparedScan(
+                source,
+                selection,
+                folder,
+                request.truth,
+                light_asked(request.values["photons_per_count"], request.values["dose_in"]),
+            ),
+            methods=request.methods or (),
+            several=SeveralVolumes(request.volumes or 0, further, request.spectra, names_in(request.states)),
+            depth="quick" if request.quick else "full",
+            max_seconds=request.max_seconds,
+            seconds=request.seconds,
+            seed=request.seed,
             command=repeating(context, files, folder),
         )
-        if not dry:
+        if not request.dry:
             table = run_tradeoff(options, sink, SystemClock(), begun=begun)
-    if dry:
-        print_dry_run(partial(planned_tradeoff, options), folder, as_json)
+    if request.dry:
+        print_dry_run(partial(planned_tradeoff, options), folder, request.as_json)
         return
-    if not as_json:
+    if not request.as_json:
         click.echo(text(table, TRADEOFF))
         click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
     if table.stopped:

@@ -14,9 +14,8 @@ from beamline.cli.options import FiniteRange, config_argument, json_events, json
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
 from beamline.core.events import Done, Sink
-from beamline.core.signals import stop_signals
 from beamline.core.sinks import Announcer
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 
 if TYPE_CHECKING:
     from beamline.config.load import Config

@@ -17,8 +17,7 @@ from beamline.cli.terminal import Terminal, counting, events_shown
 from beamline.cli.xafs_curves import CurveJob, CurveOptions, run_job
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:

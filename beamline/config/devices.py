@@ -22,9 +22,7 @@ from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
-from drivers.beam_monitors.page import url_problem
-from drivers.beam_monitors.reading import pattern_problem
-from drivers.beam_monitors.serial import PATTERN, QUERY
+from drivers.beam_monitors.reading import PATTERN, QUERY, pattern_problem, url_problem
 from drivers.cameras import CAMERAS
 from drivers.epics.devices import ShutterPvs
 from drivers.stages.registry import STAGES

@@ -15,11 +15,11 @@ from beamline.config.monochromator import EpicsMonochromator, MonochromatorConfi
 from beamline.config.places import EpicsFilter, FilterConfig, MotorFilter
 from beamline.core.machine import free_memory
 from beamline.core.text import size
-from beamline.doctor import camera, disk
+from beamline.doctor import devices, disk
 from beamline.doctor.check import Diagnosis, Grade, of_error
+from beamline.doctor.devices import port, ports
 from beamline.doctor.disk import ScanNeeds, needs
-from beamline.doctor.ports import port, ports
-from beamline.instrument.devices import make_beam_monitor
+from beamline.instrument.connect import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
@@ -46,10 +46,10 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
         need = needs(worked, cam.ring_mb * 1_000_000 if isinstance(cam, DcamOrca) else 0)
         yield frame_rate(worked)
     if cam is None or isinstance(cam, DcamOrca):
-        yield camera.link(cam, usb)
-        yield camera.library(cam, session)
+        yield devices.link(cam, usb)
+        yield devices.library(cam, session)
     else:
-        for name in (camera.LINK, camera.LIBRARY):
+        for name in (devices.LINK, devices.LIBRARY):
             yield Diagnosis(name, Grade.NOT_APPLICABLE, "The camera is simulated.")
     found = serial_ports()
     if config is None:

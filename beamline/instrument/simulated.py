@@ -60,7 +60,7 @@ def simulated_devices(
     Raises:
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
-    from simulators.devices.camera import SimulatedOrcaQuest
+    from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
     from simulators.devices.monochromator import SimulatedMonochromator
     from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
     from simulators.devices.trigger_line import TriggerLine
@@ -99,7 +99,8 @@ def simulated_devices(
         changer = ManualFilter(lambda request: None)
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, pixel_pitch=pitch, model=model)
+    build = OrcaQuestBuild(pixel_pitch=pitch, model=model)
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, build)
     opened.callback(camera.close)
     monochromator: Monochromator | None = None
     if isinstance(section := config.devices.monochromator, SceneMonochromator):

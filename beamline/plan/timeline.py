@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
+from beamline.plan.angles import Retake, retake_block, return_block, spread
 from beamline.plan.limits import PlanFacts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.retake import Retake, retake_block, return_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain

@@ -13,8 +13,8 @@ from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.validate import quantity_said, references_present, scan_ended, scan_findings
 
 

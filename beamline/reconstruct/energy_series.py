@@ -12,8 +12,8 @@ import numpy as np
 from beamline.core.errors import ConfigError
 from beamline.core.events import Sink
 from beamline.core.files import refuse_existing, remove
-from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import Warnings
+from beamline.core.stop import StopOnSignal
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection

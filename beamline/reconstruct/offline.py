@@ -28,6 +28,7 @@ from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
 from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.remarks import partly_seen_warning
@@ -53,7 +54,6 @@ from recon.base.method import (
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
-from recon.methods import with_trait
 from recon.splatting.backend import backend_for
 from recon.splatting.fit_method import FitMethod
 from recon.warm_up import warm_up
@@ -128,7 +128,9 @@ def _refuse_impossible(options: ReconOptions) -> None:
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
-    _refuse_foreign(options)
+    options.refuse_contradictions()
+    if options.method.traits.in_time:
+        _require_hdf5(options.target)
     if options.uncertainty:
         refuse_impossible(options)
     if options.cluster is not None:
@@ -193,32 +195,10 @@ def check_device(device: str) -> None:
         raise ConfigError(f"--device {device}: {error}. Leave it out to compute on the CPU.") from error
 
 
-def _refuse_foreign(options: ReconOptions) -> None:
-    """Raises ConfigError for options that the method would silently ignore."""
-    if options.method.traits.in_time:
-        _refuse_for_series(options)
-    given = {
-        "a quality preset": (options.quality is not None, "presets"),
-        "a time budget": (options.budget is not None, "budget"),
-        "checkpoints": (options.checkpoints.wanted, "checkpoints"),
-    }
-    for what, (asked, trait) in given.items():
-        if asked and not getattr(options.method.traits, trait):
-            owners = ", ".join(with_trait(trait))
-            raise ConfigError(
-                f"{options.method.name} does not take {what} (of {owners}): leave that out, or choose another method."
-            )
-
-
-def _refuse_for_series(options: ReconOptions) -> None:
-    """Raises ConfigError for what is of one volume alone."""
-    of_one = {"a box of voxels": options.region, "a truth": options.truth, "a cluster": options.cluster}
-    for what, given in of_one.items():
-        if given is not None:
-            raise ConfigError(f"Volumes in time do not go with {what}: leave that out. Nothing was read.")
-    output = options.target.output
-    if options.target.written and output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
+def _require_hdf5(target: OutputPaths) -> None:
+    """Raises ConfigError for a file that holds one volume."""
+    if target.written and target.output.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"-o {target.output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
 
 
 @dataclass(frozen=True, eq=False)

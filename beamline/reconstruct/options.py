@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.region import Region, selection_around
 from beamline.storage.readers.base import ScanSource
@@ -16,7 +18,7 @@ from beamline.storage.writers.partial_volume import can_become
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Method, PresetMethod
-from recon.methods import names, streams
+from recon.methods import has_setting, names, streams
 from recon.splatting.fit_method import StreamingMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
@@ -64,6 +66,30 @@ class ReconOptions:
     uncertainty: bool = False
     command: str = ""
     recipe: str = ""
+
+    @property
+    def given(self) -> frozenset[str]:
+        """Names of the options, as `option_rules` has them, whose values differ from their defaults."""
+        usual = {each.name: each.default for each in fields(self)}
+        run = {name for name, rule in RULES.items() if _at(self, rule.value) not in (None, usual.get(rule.value))}
+        unset = type(self.method)()
+        of_method = {
+            name
+            for name, rule in RULES.items()
+            if rule.setting and has_setting(type(self.method), rule.setting)
+            if _at(self.method, rule.setting) != _at(unset, rule.setting)
+        }
+        return frozenset(run | of_method | ({"time"} if self.method.traits.in_time else set()))
+
+    def refuse_contradictions(self, *also: str) -> None:
+        """Raises ConfigError for values that do not go together, or that the method would silently ignore.
+
+        Args:
+            also: options that no value here tells of, such as "follow".
+        """
+        given = self.given | set(also)
+        if why := contradiction(RULES, given, one_method=True) or of_other_methods(RULES, given, self.method.name):
+            raise ConfigError(why)
 
     @property
     def becomes_output(self) -> bool:
@@ -121,3 +147,10 @@ class ReconOptions:
                 f"run {self.method.name} without --follow when the scan has ended."
             )
         return self.method
+
+
+def _at(whole: Any, path: str) -> Any:
+    """The value at a path such as `fit.loss`; None where there is none."""
+    for name in path.split("."):
+        whole = getattr(whole, name, None)
+    return whole

@@ -19,7 +19,7 @@ from beamline.report.slice_sheet import SliceSheet
 from beamline.report.time_curves import quality_against_time
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
-from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.methods import BASELINE
 from recon.voxels.unexplained import LIMIT, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
@@ -215,7 +215,7 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
     return pictures
 
 
-def _times(series: VolumesInTime) -> list[Picture]:
+def _times(series: VolumeSeries) -> list[Picture]:
     """Slices of some volumes in time, side by side."""
     n, depth = series.data.shape[:2]
     some = np.unique(np.linspace(0, n - 1, min(n, _SHOWN)).round().astype(int))

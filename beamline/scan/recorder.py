@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import Protocol
@@ -29,10 +29,9 @@ from beamline.core.text import count, spans
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digests
-from beamline.monitor.rehearsal import rehearse
-from beamline.monitor.watch import Monitor, look_past_failures
+from beamline.monitor.watch import Monitor, look_past_failures, rehearse
+from beamline.plan.angles import Retake
 from beamline.plan.plan import Timeline
-from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
 from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
 from drivers.base.frame import Frame, FrameKind
@@ -80,6 +79,22 @@ _Item = _Checked | BaseException | threading.Event | None
 """What comes to the second thread; an exception: the frame could not be digested."""
 
 
+@dataclass(frozen=True, eq=False)
+class Consequences:
+    """What follows from flags while a scan runs.
+
+    Attributes:
+        react: told the flags of each frame.
+        retaken_warnings: checks whose warnings have views taken again.
+    """
+
+    react: Callable[[tuple[Flag, ...]], None] = lambda flags: None
+    retaken_warnings: frozenset[str] = frozenset()
+
+
+_NONE = Consequences()
+
+
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
 
@@ -91,10 +106,8 @@ class Recorder:
     neither disk nor checks: what the camera still owes is kept in memory.
 
     Args:
-        react: told the flags of each frame.
         pause: a request that pauses the scan.
         stop: the scan's.
-        retaken_warnings: checks whose warnings have views taken again.
 
     Attributes:
         n_frames: written so far.
@@ -110,13 +123,12 @@ class Recorder:
         *,
         preview_bin: int,
         sink: Sink,
-        react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
+        consequences: Consequences = _NONE,
         pause: PauseRequest | None = None,
         stop: StopRequest | None = None,
-        retaken_warnings: frozenset[str] = frozenset(),
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
-        self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
+        self._sink, self._consequences = sink, consequences
         self._progress = _Progress(timeline)
         self._stop = stop or StopRequest()
         self._active: set[tuple[str, Level]] = set()
@@ -215,7 +227,9 @@ class Recorder:
     @property
     def views_to_retake(self) -> list[Retake]:
         """Views with an alarm or a warning that asks for it, with the trigger that each would be taken again by."""
-        warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
+        warned = self._frames(
+            lambda flag: flag.level is Level.WARN and flag.check in self._consequences.retaken_warnings
+        )
         return [Retake(row, self._triggers[row]) for row in sorted((self._alarmed | warned) & self._triggers.keys())]
 
     @property
@@ -443,7 +457,7 @@ class Recorder:
             if (flag.check, flag.level) not in self._active:
                 self._sink(FrameFlagged(flag))
         self._active = active
-        self._react(flags)
+        self._consequences.react(flags)
 
 
 def _as_stored(frame: Frame) -> Frame:

@@ -33,7 +33,7 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
-from beamline.plan.retake import Retake, spread
+from beamline.plan.angles import Retake, spread
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog, beam_log
@@ -41,7 +41,7 @@ from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
 from beamline.scan.preflight import ReadyScan, all_of, preflight
-from beamline.scan.recorder import Recorder, frames_in_memory
+from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
 from beamline.scan.resume import ResumableRun, other_devices
 from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
@@ -377,10 +377,12 @@ class _Run:
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             sink=self.sink,
-            react=AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
+            consequences=Consequences(
+                AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
+                monitor.retaken_warnings,
+            ),
             pause=self.pause,
             stop=self.stop,
-            retaken_warnings=monitor.retaken_warnings,
         )
 
     def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:

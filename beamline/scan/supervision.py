@@ -12,7 +12,7 @@ from beamline.core.events import Sink, Warned
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import size
 from beamline.monitor.check import Flag, Level, Policy
-from beamline.plan.retake import Retake
+from beamline.plan.angles import Retake
 from beamline.scan.states import State, StateMachine
 from drivers.base.protocols import BeamReading
 

@@ -21,9 +21,8 @@ from simulators.frame.sensor import largest_count
 from simulators.light.beam import Beam
 from simulators.light.spectrum import Attenuation, light
 from simulators.samples.composed.parts import Mixture
-from simulators.scenes.expose import expose
+from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import load_scene
-from simulators.scenes.shots import Scan
 
 Reals = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ from matplotlib.patches import Rectangle
 from beamline.report.figures import grey_window, png
 from drivers.base.frame import FrameKind
 from simulators.effects.chain import Anomaly
-from simulators.scenes.expose import expose
-from simulators.scenes.shots import Scan
+from simulators.scenes.expose import Scan, expose
 
 COLUMNS, PICTURES = 4, 8
 _COLOURS = ("tab:orange", "tab:cyan", "tab:pink", "tab:olive", "tab:green", "tab:red", "tab:purple")

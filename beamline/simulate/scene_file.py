@@ -15,15 +15,15 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.shipped import shipped_scenes
 from beamline.core.text import size
-from beamline.storage.mesh_reader import READERS, read_mesh
+from beamline.storage.mesh_file import READERS, read_mesh
 from beamline.storage.volumes.files import whole_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.emission import EmissionScene, load_emission
 from simulators.scenes.explain import FrameCost, explain
+from simulators.scenes.expose import Scan as Scan
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
-from simulators.scenes.shots import Scan as Scan
 
 if TYPE_CHECKING:
     from simulators.samples.voxels.volume import ReadVolume

@@ -1,4 +1,5 @@
-"""Write: writes a simulated scan frame by frame into a file like an instrument's, with the labels of its anomalies."""
+"""Writes a simulated scan frame by frame into a file like an instrument's, with the labels of its anomalies; or the
+counts of a scene that emits."""
 
 from __future__ import annotations
 
@@ -11,22 +12,27 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from beamline.core.errors import DataError
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import FrameStored, Sink
-from beamline.core.files import refuse_existing
+from beamline.core.files import refuse_existing, whole_file
+from beamline.core.machine import free_memory
 from beamline.core.machine_speed import seconds_left
 from beamline.core.text import size
 from beamline.monitor.digest import digest
 from beamline.plan.limits import ROOM
 from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
 from beamline.simulate.scene_file import SceneFile
+from beamline.storage import hdf5
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.anomaly import Label
-from simulators.scenes.expose import expose
-from simulators.scenes.shots import PlannedFrame, Scan
+from simulators.scenes.emission import EmissionScene as EmissionScene
+from simulators.scenes.emission import Events, events
+from simulators.scenes.expose import PlannedFrame, Scan, expose
 
 PREVIEW_BIN = 4
 REPORT_EVERY = 0.1  # s of real time between `frame` events
@@ -149,3 +155,35 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
             }
         },
     )
+
+
+_BYTES_A_LINE = 120  # as measured
+
+
+def emit(scene: EmissionScene, seed: int, progress: Callable[[int, int], object]) -> Events:
+    """The counts of a scene. Raises ConfigError where the memory does not hold them."""
+    needed, free = _BYTES_A_LINE * scene.lines.views * math.prod(scene.lines.shape), free_memory()
+    if needed > free:
+        raise ConfigError(
+            f"The lines take {size(needed)} of memory, {size(free)} are free. Give fewer lines, or --frames. Nothing "
+            "was simulated."
+        )
+    return events(scene.emission, scene.lines.detector, scene.lines.angles, scene.scanner, seed, progress)
+
+
+def write_emission(path: Path, scene: EmissionScene, made: Events) -> None:
+    """Write counts, and all that is known of them, to an HDF5 file, complete or not at all.
+
+    Raises:
+        DataError: `path` exists or cannot be written.
+    """
+    sets = {
+        "counts": made.counts, "attenuation": made.attenuation, "normalisation": made.efficiency,
+        "randoms": made.randoms, "scatter": made.scatter,
+    }  # fmt: skip
+    with whole_file(path) as partial, hdf5.created(partial) as file:
+        group = file.create_group("emission")
+        for name, values in sets.items():
+            group.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", fletcher32=True)
+        group["angles"], group["pixel_size"] = np.degrees(scene.lines.angles), scene.lines.pitch
+        group["angles"].attrs["units"], group["pixel_size"].attrs["units"] = "degree", "mm"

@@ -15,7 +15,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
 from beamline.storage import hdf5
-from beamline.storage.readers.nexus_places import choose, find
+from beamline.storage.readers.nexus import choose, find
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.voxel_kind import VoxelKind
 from recon.assess.time_model import NextDecibel
-from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.volume import Grid, Volume, VolumeSeries
 
 Value = str | int | float | bool | NDArray[Any]
 _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that tell how it ended
@@ -85,7 +85,7 @@ class ReconRecord:
     deviation: NDArray[np.float32] | None = None
     fbp: NDArray[np.float32] | None = None
     kind: VoxelKind = VoxelKind.ATTENUATION
-    series: VolumesInTime | None = None
+    series: VolumeSeries | None = None
     compared: Mapping[str, float] | None = None
     warnings: Sequence[str] = ()
     hiding: str = ""

@@ -11,17 +11,23 @@ from types import MappingProxyType
 from typing import Any
 
 from drivers.base.errors import DeviceError
-from drivers.dcam.codes import Capability, CaptureMode, CaptureState, Error, Property, Text, error_name
-from drivers.dcam.structures import (
+from drivers.dcam.codes import (
     ApiInit,
     BufFrame,
+    Capability,
+    CaptureMode,
+    CaptureState,
     DevCapability,
     DevOpen,
     DevString,
+    Error,
     PropAttr,
+    Property,
+    Text,
     TransferInfo,
     WaitOpen,
     WaitStart,
+    error_name,
 )
 
 _TEXT_BYTES = 256

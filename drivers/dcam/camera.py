@@ -11,14 +11,12 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from drivers.dcam import cooling
 from drivers.dcam.abi import DcamError
-from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property
-from drivers.dcam.description import description
+from drivers.dcam.codes import BufFrame, CaptureMode, CaptureState, Error, Property
 from drivers.dcam.options import DcamOptions, TriggerMode
 from drivers.dcam.properties import Properties
 from drivers.dcam.ring import START_TIMEOUT, Ring, require_stamps, seconds_of
 from drivers.dcam.session import Session, run_all
-from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
-from drivers.dcam.structures import BufFrame
+from drivers.dcam.settings import apply_settings, apply_trigger_source, description, read_settings, read_timing
 from drivers.frame_memory import FrameMemory
 
 _WAIT_SLICE = 0.1  # s; short, since an event between a check and the wait is missed

@@ -5,8 +5,7 @@ from __future__ import annotations
 from drivers.base.errors import DeviceRefused
 from drivers.dcam import codes
 from drivers.dcam.abi import Dcam, DcamError
-from drivers.dcam.codes import Error, Property
-from drivers.dcam.structures import PropAttr
+from drivers.dcam.codes import Error, PropAttr, Property
 
 _UNKNOWN = frozenset((Error.NOTSUPPORT, Error.INVALIDPROPERTYID))
 """Errors that a camera returns for a property that it does not have."""

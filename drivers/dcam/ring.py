@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.dcam.abi import RUNTIME, Dcam
-from drivers.dcam.codes import CaptureMode, CaptureState
+from drivers.dcam.codes import BufFrame, CaptureMode, CaptureState
 from drivers.dcam.session import run_all
-from drivers.dcam.structures import BufFrame
 from drivers.frame_memory import FrameMemory
 
 START_TIMEOUT = 5.0  # s that a camera may take to start a capture

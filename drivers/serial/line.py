@@ -35,18 +35,31 @@ class Probe:
     reply: str
 
 
+@dataclass(frozen=True, eq=False)
+class LineRules:
+    """How a device talks.
+
+    Attributes:
+        unsolicited: regular expression of lines that the device may send without a request; they are skipped and
+            recorded.
+        identified: each reply has the number of its request, so that a second one comes from another device.
+        check: returns the fault of a received line, "" if it is good; for checksums.
+    """
+
+    probe: Probe
+    unsolicited: str = NEVER
+    framing: Framing = CRLF
+    identified: bool = False
+    check: Callable[[str], str] = lambda line: ""
+
+
 class SerialLine:
     """A device that talks in ASCII lines; 8 data bits, no parity, 1 stop bit. Safe from several threads.
 
     Args:
         url: pyserial URL: "/dev/ttyUSB0", "COM3", "socket://host:port", "sim://name".
         device: its name in error messages.
-        probe: see `Probe`.
         timeout: s for a whole reply, more than 0.
-        unsolicited: regular expression of lines that the device may send without a request; they are skipped and
-            recorded.
-        identified: each reply has the number of its request, so that a second one comes from another device.
-        check: returns the fault of a received line, "" if it is good; for checksums.
         transcript: log file to which every byte sent and received is appended with its time; None: no file.
 
     Raises:
@@ -57,22 +70,18 @@ class SerialLine:
     def __init__(
         self,
         url: str,
+        rules: LineRules,
+        clock: Clock,
         *,
         device: str,
-        probe: Probe,
-        clock: Clock,
         timeout: float,
         baudrate: int,
-        unsolicited: str = r"(?!)",
-        framing: Framing = CRLF,
-        identified: bool = False,
-        check: Callable[[str], str] = lambda line: "",
         transcript: Path | None = None,
     ) -> None:
-        self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
+        self._device, self._probe, self._clock, self._timeout = device, rules.probe, clock, timeout
         self._asking, self._writing = threading.RLock(), threading.Lock()
-        self._framing, self._in_step, self._closed = framing, True, False
-        self._identified = identified
+        self._framing, self._in_step, self._closed = rules.framing, True, False
+        self._identified = rules.identified
         self._answered = "", NEVER  # the last request that was answered, and the form of its reply
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
@@ -103,7 +112,7 @@ class SerialLine:
                 advice="Check the cable, the port's name in the configuration and that no other program holds it",
                 state="Nothing was sent",
             ) from problem
-        self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
+        self._reader = LineReader(self._port, clock, self._transcript, rules.framing, rules.unsolicited, rules.check)
 
     def send(self, command: str | bytes) -> None:
         """Send a command without a reply, at once, even while another thread waits, or the line is out of step.

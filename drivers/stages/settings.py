@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
 from drivers.flat import flat_fields
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine
 
 FARTHEST = 1e9  # rad
 MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
@@ -143,10 +143,10 @@ class Wiring:
         if not 0 < self.timeout < math.inf:
             raise ValueError(f"a timeout of {self.timeout:g} s is not possible; expected a positive number of seconds")
 
-    def line(self, url: str, name: str, clock: Clock, probe: Probe, **more: Any) -> SerialLine:
-        """The open line to the controller of the stage `name`; `more` as in `SerialLine`."""
+    def line(self, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+        """The open line to the controller of the stage `name`; `rules` as in `LineRules`."""
         given: dict[str, Any] = {"timeout": self.timeout, "baudrate": self.baudrate, "transcript": self.transcript}
-        return SerialLine(url, device=name, probe=probe, clock=clock, **given, **more)
+        return SerialLine(url, LineRules(probe, **rules), clock, device=name, **given)
 
 
 class StageSettings(Protocol):

@@ -26,7 +26,7 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,22 @@ from recon.base.ray_width import NO_WIDTH, RayWidth
 _OF_VIEWS = "angles", "shifts", "roll", "tilt"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
+
+
+class Where(TypedDict, total=False):
+    """Where the rotation axis falls on the detector, and how each view lies; as the attributes of `Geometry`.
+
+    Attributes:
+        axis_col, axis_row: None or left out: the middle of the detector, at (cols - 1) / 2; rows alike.
+        shifts: [view, 2] pixels; None or left out: none.
+        roll, tilt: radians, one for all views or [view]; left out: 0.
+    """
+
+    axis_col: float | None
+    axis_row: float | None
+    shifts: ArrayLike | None
+    roll: ArrayLike
+    tilt: ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,20 +102,17 @@ class Geometry:
         detector_shape: tuple[int, int],
         *,
         pixel_pitch: float = 1.0,
-        axis_col: float | None = None,
-        axis_row: float | None = None,
-        shifts: ArrayLike | None = None,
-        roll: ArrayLike = 0.0,
-        tilt: ArrayLike = 0.0,
+        **where: Unpack[Where],
     ) -> Geometry:
-        """Parallel beam. `axis_col=None` puts the axis in the middle of the detector, at (cols - 1) / 2; rows alike.
+        """Parallel beam.
+
+        Args:
+            where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
 
         Raises:
             ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
         """
-        return _checked(
-            angles, detector_shape, pixel_pitch, axis_col, axis_row, math.inf, math.inf, shifts, roll, tilt
-        )  # fmt: skip
+        return _checked(angles, detector_shape, pixel_pitch, (math.inf, math.inf), **where)
 
     @classmethod
     def cone(
@@ -109,23 +122,19 @@ class Geometry:
         pixel_pitch: float,
         sod: float,
         sdd: float,
-        *,
-        axis_col: float | None = None,
-        axis_row: float | None = None,
-        shifts: ArrayLike | None = None,
-        roll: ArrayLike = 0.0,
-        tilt: ArrayLike = 0.0,
+        **where: Unpack[Where],
     ) -> Geometry:
         """Cone beam from a point `sod` mm before the rotation axis onto a flat detector `sdd` mm behind the source.
+
+        Args:
+            where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
 
         Raises:
             ValueError: as `parallel`, and for distances that are not finite with 0 < sod <= sdd.
         """
         if not (math.isfinite(sod) and math.isfinite(sdd) and 0 < sod <= sdd):
             raise ValueError(f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}")
-        return _checked(
-            angles, detector_shape, pixel_pitch, axis_col, axis_row, float(sod), float(sdd), shifts, roll, tilt
-        )  # fmt: skip
+        return _checked(angles, detector_shape, pixel_pitch, (float(sod), float(sdd)), **where)
 
     @classmethod
     def fan(
@@ -288,8 +297,9 @@ class Geometry:
                 )
         n = np.size(angles)
         return _checked(
-            angles, self.detector_shape, self.pixel_pitch, self.axis_col, self.axis_row, self.sod, self.sdd,
-            np.broadcast_to(self.shifts[0], (n, 2)), self.roll[0], self.tilt[0],
+            angles, self.detector_shape, self.pixel_pitch, (self.sod, self.sdd), axis_col=self.axis_col,
+            axis_row=self.axis_row, shifts=np.broadcast_to(self.shifts[0], (n, 2)), roll=self.roll[0],
+            tilt=self.tilt[0],
         ).seen_with(self.width, self.skew)  # fmt: skip
 
     def followed_by(self, other: Geometry) -> Geometry:
@@ -373,14 +383,13 @@ def _checked(
     angles: ArrayLike,
     detector_shape: tuple[int, int],
     pixel_pitch: float,
-    axis_col: float | None,
-    axis_row: float | None,
-    sod: float,
-    sdd: float,
-    shifts: ArrayLike | None,
-    roll: ArrayLike,
-    tilt: ArrayLike,
+    distances: tuple[float, float],
+    **where: Unpack[Where],
 ) -> Geometry:
+    """The geometry with these `sod` and `sdd`. TypeError: a keyword that `Where` lacks."""
+    if unknown := where.keys() - Where.__annotations__.keys():
+        raise TypeError(f"a geometry has no {', '.join(sorted(unknown))}; expected {', '.join(Where.__annotations__)}")
+    axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
     theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
     rows, cols = (operator.index(n) for n in detector_shape)
     if theta.ndim != 1 or theta.size == 0:
@@ -401,13 +410,13 @@ def _checked(
     if moved.shape != (theta.size, 2) or not np.isfinite(moved).all():
         raise ValueError(f"shifts must be finite pixels (col, row) [{theta.size}, 2], got shape {moved.shape}")
     turned = []
-    for name, turn in (("roll", roll), ("tilt", tilt)):
+    for name, turn in (("roll", where.get("roll", 0.0)), ("tilt", where.get("tilt", 0.0))):
         given = np.asarray(turn, np.float64)
         if given.shape not in ((), (theta.size,)) or not np.isfinite(given).all():
             raise ValueError(f"{name} must be finite radians, one for all views or [{theta.size}], got {given.shape}")
         turned.append(_frozen(np.broadcast_to(given, theta.shape)))
     return Geometry(
-        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, sod, sdd, _frozen(moved), turned[0], turned[1]
+        _frozen(theta), (rows, cols), float(pixel_pitch), col, row, *distances, _frozen(moved), turned[0], turned[1]
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
-from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.volume import Grid, Volume, VolumeSeries
 
 Plain = str | int | float
 Clock = Callable[[], float]
@@ -55,6 +55,19 @@ class Progress:
 
 
 @dataclass(frozen=True, eq=False)
+class Energies:
+    """The energies of views, and what pure materials attenuate there.
+
+    Attributes:
+        of_view: [view] index of the energy of each.
+        cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
+    """
+
+    of_view: NDArray[np.intp]
+    cross_sections: F64
+
+
+@dataclass(frozen=True, eq=False)
 class DataUse:
     """How the projections are used.
 
@@ -66,12 +79,15 @@ class DataUse:
             made of. None: these are all there is.
         times: [view] when each was exposed, in s, for a method of volumes in time; None: evenly, in the order of the
             views.
+        energies: of the views, for a method of volumes of materials; None: all have one, at which there is one material
+            of attenuation 1.
     """
 
     weights: F32 | None = None
     held_out: Sequence[int] = ()
     emission: Any = None
     times: F64 | None = None
+    energies: Energies | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +145,7 @@ class Reconstruction:
         method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
         seconds: wall time of the reconstruction, which the caller of `run` measures.
         deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
-        series: all volumes in time, the first of which is `volume`; None: the method makes one.
+        series: all volumes, the first of which is `volume`; None: the method makes one.
     """
 
     volume: Volume
@@ -140,7 +156,7 @@ class Reconstruction:
     method: str = ""
     seconds: float = 0.0
     deviation: Volume | None = None
-    series: VolumesInTime | None = None
+    series: VolumeSeries | None = None
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
@@ -180,7 +196,8 @@ class Traits:
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
-        in_time: it makes several volumes, at times of the scan, all at once in memory.
+        in_time: it makes several volumes, at times of the scan, all at once in memory; it is a `JointMethod`.
+        by_energy: likewise, of each material, from scans at several energies.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
         error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
@@ -195,9 +212,15 @@ class Traits:
     any_grid: bool = False
     needs_matter: bool = False
     in_time: bool = False
+    by_energy: bool = False
     own_length: bool = False
     halo: int = 0
     error_bars: tuple[float, float] | None = None
+
+    @property
+    def several(self) -> bool:
+        """It makes several volumes, which all views determine together."""
+        return self.in_time or self.by_energy
 
 
 class Method(Protocol):
@@ -225,6 +248,18 @@ class Method(Protocol):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Most bytes that `run` takes beside the projections, and beside their weights if they are `weighted`."""
+
+
+class JointMethod(Method, Protocol):
+    """A method with the trait `in_time` or `by_energy`: `Reconstruction.series` has all of its volumes."""
+
+    @property
+    def volumes(self) -> int:
+        """How many it makes."""
+
+    @property
+    def volume_names(self) -> tuple[str, ...]:
+        """Of the materials; empty where volumes are of times."""
 
 
 @runtime_checkable
@@ -282,8 +317,13 @@ class CheckpointedMethod(Method, Protocol):
 
 
 def volumes_of(method: Any) -> int:
-    """How many volumes a method makes: with the trait `in_time` as many as its setting `volumes` says."""
-    return int(method.volumes) if method.traits.in_time else 1
+    """How many volumes a method makes."""
+    return int(method.volumes) if method.traits.several else 1
+
+
+def volume_names_of(method: Any) -> tuple[str, ...]:
+    """Names of the volumes of a method where each is of a material; otherwise empty."""
+    return tuple(method.volume_names) if method.traits.several else ()
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:

@@ -1,4 +1,4 @@
-"""Grid, Volume and VolumesInTime: a box of voxels in the object's frame, and the attenuation in it."""
+"""Grid, Volume and VolumeSeries: a box of voxels in the object's frame, and the attenuation in it."""
 
 from __future__ import annotations
 
@@ -204,23 +204,30 @@ class Volume:
 
 
 @dataclass(frozen=True, eq=False)
-class VolumesInTime:
-    """Volumes of a sample that changes.
+class VolumeSeries:
+    """Volumes that all views determine together: of a sample that changes, or of each of its materials.
 
     Attributes:
-        seconds: float64 [time], from the first view on.
-        data: float32 [time, z, y, x], or a dataset of a file.
-        residual: what they leave of the views, each view at its time, over the views (root mean squares); NaN as read
-            from a file, whose metrics have it.
+        seconds: float64 [volume], from the first view on; empty where they are of materials.
+        data: float32 [volume, z, y, x], or a dataset of a file.
+        residual: what they leave of the views, each view with the mixture that it shows, over the views (root mean
+            squares); NaN as read from a file, whose metrics have it.
+        names: of the materials; empty where they are of times.
     """
 
     seconds: NDArray[np.float64]
     data: Any
     residual: float = math.nan
+    names: tuple[str, ...] = ()
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A short text on each, for people."""
+        return self.names or tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
         """The volumes, which are read where they are sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
+        return [_VolumeAt(self.data, at) for at in range(len(self.labels))]
 
 
 class _VolumeAt:

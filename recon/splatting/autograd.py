@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,29 +15,38 @@ from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu, Pass
 
 
+class On(NamedTuple):
+    """What raw parameters are of, and what computes them; `unit` is that of the densities."""
+
+    unit: float
+    kernel: Kernel
+    backend: Backend[Any]
+
+
 class Project(torch.autograd.Function):
     """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], geometry: Geometry, faint: float, cut: float, model: RayModel,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, geometry: Geometry,
+        how: tuple[float, float, RayModel],
     ) -> Tensor:  # fmt: skip
+        """Images [view, row, col]; `how` is what is too faint, the truncation in standard deviations, and the rays."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), geometry, (faint, cut, model)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
+        ctx.given = on, geometry, how
+        run = _begin((means, log_scales, quaternions, raw), on)
         images = means.new_empty((geometry.n_views, *geometry.detector_shape))
         for view, image in enumerate(images):
-            image.copy_(torch.as_tensor(run.view(geometry, view, faint, cut, model).image))
+            image.copy_(torch.as_tensor(run.view(geometry, view, *how).image))
         return images
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
         on, geometry, how = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
+        run = _begin(ctx.saved_tensors, on)
         for view, slope in enumerate(gradient):
-            run.view(geometry, view, *how).backward(_native(slope, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 7)
+            run.view(geometry, view, *how).backward(_native(slope, on.backend))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
 class Voxelize(torch.autograd.Function):
@@ -45,25 +54,26 @@ class Voxelize(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
-        backend: Backend[Any], grid: Grid, faint: float, cut: float,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, on: On, grid: Grid,
+        how: tuple[float, float],
     ) -> Tensor:  # fmt: skip
+        """Density [z, y, x]; `how` is what is too faint, and the truncation in standard deviations."""
         ctx.save_for_backward(means, log_scales, quaternions, raw)
-        ctx.given = (unit, kernel, backend), (grid, faint, cut)
-        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
-        return torch.as_tensor(run.box(grid, faint, cut).density)
+        ctx.given = on, grid, how
+        run = _begin((means, log_scales, quaternions, raw), on)
+        return torch.as_tensor(run.box(grid, *how).density)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        on, where = ctx.given
-        run = _begin(ctx.saved_tensors, *on)
-        run.box(*where).backward(_native(gradient, on[-1]))
-        return (*map(torch.as_tensor, run.gradients()), *[None] * 6)
+        on, grid, how = ctx.given
+        run = _begin(ctx.saved_tensors, on)
+        run.box(grid, *how).backward(_native(gradient, on.backend))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 3)
 
 
-def _begin(parameters: Sequence[Tensor], unit: float, kernel: Kernel, backend: Backend[Any]) -> Pass[Any]:
-    means, log_scales, quaternions, raw = (_native(tensor, backend) for tensor in parameters)
-    return backend.begin(means, log_scales, quaternions, raw, unit, kernel)
+def _begin(parameters: Sequence[Tensor], on: On) -> Pass[Any]:
+    means, log_scales, quaternions, raw = (_native(tensor, on.backend) for tensor in parameters)
+    return on.backend.begin(means, log_scales, quaternions, raw, on.unit, on.kernel)
 
 
 def _native(tensor: Tensor, backend: Backend[Any]) -> Any:

@@ -74,10 +74,7 @@ class Change:
 
 
 def control(
-    means: F32,
-    log_scales: F32,
-    rotations: F32,
-    raw: F32,
+    model: tuple[F32, F32, F32, F32],
     statistic: F32,
     policy: DensityPolicy,
     field: float,
@@ -92,7 +89,7 @@ def control(
     Only the mass of the pruned ones is lost, which is negligible.
 
     Args:
-        means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]: the model; ρ = softplus(raw) in density units.
+        model: means [n, 3] mm, log_scales [n, 3], rotations [n, 9], raw [n]; ρ = softplus(raw) in density units.
         statistic: [n], the mean gradient that is compared with `policy.threshold`.
         field: width of the field of view, mm.
         limit: largest number of Gaussians.
@@ -100,6 +97,7 @@ def control(
             of its longest axis outside is removed.
         rng: draws the direction in which a clone or half moves.
     """
+    means, log_scales, rotations, raw = model
     density = np.logaddexp(0, raw)
     lost = _LOST if policy.rule == "mass" else 0.0
     reach = lost * np.exp(log_scales.max(axis=1, keepdims=True))

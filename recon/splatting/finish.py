@@ -26,7 +26,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
-from recon.voxels.iterative import prior_decisions, solve
+from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods.pnp_dct import TRIAL_THRESHOLD, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
@@ -115,7 +115,7 @@ class _Planning:
         judge = HeldOutTrial.of(problem)
         if judge is None:
             return x
-        weight = choose_weight(problem, x, modelled=False, trial=lambda: judge)
+        weight = choose_weight(problem, x, SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
         patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
@@ -228,7 +228,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     watch, decide = _Watch(control, problem.geometry.n_views), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
-    solve(method, projector, data, weight=weights, on_trial=watch.trial, decide=decide)
+    solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
     if watch.ended or "strength" not in decide.made:
         return Candidates()
     tried = method.tried
@@ -245,7 +245,7 @@ class _Finish:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
-        weight, strength = choose_weight(problem, x, modelled=True, trial=trial), 0.0
+        weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
@@ -303,7 +303,7 @@ def finish(
     watch, count = _Watch(control, problem.geometry.n_views), SWEEPS if sweeps is None else sweeps
     refined = solve(
         _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
-        on_iteration=lambda sweep, _: watch.sweep(sweep, max(sweep, count)), on_trial=watch.trial, decide=decide,
+        watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,22 @@ _SWEEP_WEIGHT = 0.004  # density units
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
 
+@dataclass(frozen=True)
+class FirstVolume:
+    """The volume that the first Gaussians are drawn from.
+
+    Attributes:
+        kind: see `first_volume`.
+        factor: binning of its views.
+    """
+
+    kind: Start = "fbp"
+    factor: int = 1
+
+
+_USUAL = FirstVolume()
+
+
 def density_unit(volume: Volume) -> float:
     """A typical high density of the volume: the 99.5th percentile of its positive part, 1/mm."""
     positive = volume.data[volume.data > 0]
@@ -98,10 +115,9 @@ def place(
     count: int | None,
     rng: np.random.Generator,
     *,
-    start: Start = "fbp",
+    start: FirstVolume = _USUAL,
     rays: RayModel | None = None,
     kernel: Kernel = Kernel.GAUSSIAN,
-    factor: int = 1,
 ) -> Gaussians:
     """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
@@ -109,8 +125,6 @@ def place(
         grid: a box that holds all that the views see (`Grid.for_fit`): a fit cannot represent matter outside. Its
             corners, outside the circle that all views see, stay empty unless the sample leaves the field.
         count: number of Gaussians; None: `default_count` of the field.
-        start: kind of first volume, see `first_volume`.
-        factor: binning of the views for the first volume.
 
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
@@ -118,15 +132,15 @@ def place(
     wanted = default_count(geometry, grid.voxel_size) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
-    if factor == 1:
-        volume = first_volume(projections, geometry, grid, start)
+    if (factor := start.factor) == 1:
+        volume = first_volume(projections, geometry, grid, start.kind)
     else:
         nz, ny, nx = (-(-n // factor) for n in grid.shape)
         pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
         coarse = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
-        volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start)
+        volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start.kind)
     radius = math.inf if leaves_the_field(projections, geometry) else geometry.reach
-    if start == "published":
+    if start.kind == "published":
         return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)

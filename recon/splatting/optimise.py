@@ -244,7 +244,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
     statistic = backend.numpy(state.statistic) / np.float32(max(1, state.seen))
     change = control(
-        p["means"], p["log_scales"], active.rotations, p["raw"], statistic, policy,
+        (p["means"], p["log_scales"], active.rotations, p["raw"]), statistic, policy,
         2 * problem.half_field, state.limit, problem.grid.edges, state.rng,
     )  # fmt: skip
     origin = np.concatenate((change.keep, change.parents))

@@ -62,7 +62,7 @@ def project(
             )
         return torch.stack(images)
     cut = truncation or Truncation()
-    return Project.apply(*_raw(g, which), chosen, _faint(cut, g, chosen), cut.sigmas, rays)
+    return Project.apply(*_raw(g, which), chosen, (_faint(cut, g, chosen), cut.sigmas, rays))
 
 
 def voxelize(
@@ -79,18 +79,20 @@ def voxelize(
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
         return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
     cut = truncation or Truncation()
-    return Voxelize.apply(*_raw(g, which), grid, cut.faint * g.density_unit, cut.sigmas)
+    return Voxelize.apply(*_raw(g, which), grid, (cut.faint * g.density_unit, cut.sigmas))
 
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
     """The first arguments of `Project` and `Voxelize`."""
+    from recon.splatting.autograd import On
+
     if implementation == "gpu":
         from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
 
         backend: Backend[Any] = Gpu(g.means.device)
     else:
         backend = Cpu()
-    return g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, g.kernel, backend
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, On(g.density_unit, g.kernel, backend)
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:

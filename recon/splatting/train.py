@@ -37,6 +37,7 @@ from recon.splatting.in_time import (
     first_sweep_seconds,
 )
 from recon.splatting.initialise import (
+    FirstVolume,
     default_count,
     joined_for,
     leaves_the_field,
@@ -316,8 +317,8 @@ def _started(
         factor = 1 if method.seconds is None else _factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
             start = place(
-                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed), start=method.start,
-                rays=settings.rays, kernel=settings.kernel, factor=factor,
+                views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed),
+                start=FirstVolume(method.start, factor), rays=settings.rays, kernel=settings.kernel,
             )  # fmt: skip
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:

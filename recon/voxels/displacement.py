@@ -19,7 +19,7 @@ from scipy.ndimage import affine_transform, gaussian_filter1d
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.iterative import solve
+from recon.voxels.iterative import Watch, solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector, seen_rays
 
@@ -237,7 +237,7 @@ class _Problem:
         data, geometry, weight = self.corrected(moves, views)
         # The weight follows the noise: views held out would judge a sample that still stands in two places.
         method, projector = OsSirtTv(SWEEPS, momentum=True), Projector(geometry, self.grid)
-        return solve(method, projector, data, weight=weight, on_trial=lambda: True)
+        return solve(method, projector, data, weight=weight, watch=Watch(on_trial=lambda: True))
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
         """Views less those of the volume, without smooth differences, and the weights of their rays."""

@@ -145,6 +145,6 @@ class _ByTheNoise:
     iterations: int = _SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        weight = NoiseBalance.of(problem, x, modelled=False, evenly=False)
+        weight = NoiseBalance.of(problem, x, self.iterations, evenly=False)
         subsets = Subsets.of(problem, _SUBSETS)
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)

@@ -20,7 +20,7 @@ from recon.base.arrays import F32, F64, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.noise_balance import NoiseBalance, determined
+from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
@@ -216,7 +216,7 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float, alike
 
 
 def choose_weight(
-    problem: VoxelProblem, start: F32, *, modelled: bool, trial: Callable[[], HeldOutTrial | None] | None = None
+    problem: VoxelProblem, start: F32, sweeps: int, trial: Callable[[], HeldOutTrial | None] | None = None
 ) -> NoiseBalance | float:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by views held out, where there are any, else by the noise.
 
@@ -224,23 +224,21 @@ def choose_weight(
     held out, and any weight takes it away from them.
 
     Args:
-        start, modelled: as of `NoiseBalance.of`.
+        start, sweeps: as of `NoiseBalance.of`.
         trial: gives that of this problem; None: `HeldOutTrial.of`.
     """
 
     def chosen() -> list[float]:
-        balance = NoiseBalance.of(problem, start, modelled)
+        balance = NoiseBalance.of(problem, start, sweeps)
         judge = (trial() if trial else HeldOutTrial.of(problem)) if balance.first > 0 else None
-        # The search begins higher where views leave much undetermined: there the noise asks for too little of a prior.
-        first = balance.first * 2.0 ** -round(math.log2(determined(problem.projector.geometry)))
-        preferred = None if judge is None else preferred_strength(judge.of_weight, first, alike_of(problem))
+        preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first, alike_of(problem))
         if judge is None or preferred is None:
             return [balance.first, balance.noise]
         judge.keep("weight", preferred)
         return [preferred.strength]
 
     first, *noise = problem.decide("weight", chosen)
-    return NoiseBalance(first, noise[0]) if noise else first
+    return NoiseBalance(first, noise[0], sweeps) if noise else first
 
 
 class WideViews(NamedTuple):

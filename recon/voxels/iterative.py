@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -55,6 +55,28 @@ class PreparedMethod(IterativeMethod, Protocol):
     def trial_sweeps(self) -> int: ...
 
 
+def _silent(*_: object) -> bool:
+    return False
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """What is called between iterations; something true that it returns ends them.
+
+    Attributes:
+        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
+            correction; the volume afterwards is better. CGLS, ASD-POCS: of the volume afterwards.
+        on_trial: called after each sweep of a trial; trials on some rows choose a method's weight. Where it ends them,
+            the iterations follow.
+    """
+
+    on_iteration: Callable[[int, float], object] = _silent
+    on_trial: Callable[[], object] = _silent
+
+
+_UNWATCHED = Watch()
+
+
 def solve(
     method: IterativeMethod,
     projector: Projector,
@@ -63,8 +85,7 @@ def solve(
     weight: F32 | None = None,
     start: Volume | None = None,
     nonnegative: bool = True,
-    on_iteration: Callable[[int, float], object] | None = None,
-    on_trial: Callable[[], object] | None = None,
+    watch: Watch = _UNWATCHED,
     decide: Decisions | None = None,
 ) -> Volume:
     """Line integrals to a volume on the projector's grid.
@@ -77,11 +98,6 @@ def solve(
             ratios of weights matter. None: one for all.
         start: the volume to begin with; None: zero.
         nonnegative: voxels below zero are clipped in every step (CGLS: at the end).
-        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
-        correction; the volume afterwards is better. CGLS, ASD-POCS: of the volume afterwards. The iterations end
-        if it returns something true.
-        on_trial: called after each sweep of a trial; trials on some rows choose a method's weight. If it returns
-        something true, the trials end, and the iterations follow.
         decide: keeps decisions that follow from the whole data, and has the seed of the order of views and subsets.
 
     Raises:
@@ -96,18 +112,15 @@ def solve(
     units = _Units(*decide(UNITS, lambda: _Units.of(projector, data, rays)))
     inside = units.enter(projector, data, rays, lines)
 
-    def go_on(iteration: int, residual: float) -> bool:
-        return on_iteration is None or not on_iteration(iteration, residual)
-
     problem = VoxelProblem(
         inside,
         data,
         rays,
         nonnegative,
         np.random.default_rng(decide.seed),
-        go_on,
+        lambda iteration, residual: not watch.on_iteration(iteration, residual),
         decide,
-        lambda: on_trial is None or not on_trial(),
+        lambda: not watch.on_trial(),
     )
     threads = get_num_threads()
     try:
@@ -142,7 +155,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     volume = solve(
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        on_iteration=report, on_trial=control.stop_trials or control.should_stop, decide=decide,
+        watch=Watch(report, control.stop_trials or control.should_stop or _silent), decide=decide,
     )  # fmt: skip
     return Reconstruction(volume, {**settings, "seed": problem.seed}, tuple(history))
 

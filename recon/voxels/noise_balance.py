@@ -16,22 +16,14 @@ from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit
 
 MATTER = 0.05  # of the density unit: voxels above it count
-# Residual over the noise up to which a volume explains its views. On eight scans that voxels explain it is 0.75 to 1.0.
-# On seven cones of coarse voxels it is 1.16 to 5.6, on three regions of interest 3 to 7.
-_EXPLAINED = 1.05
 
 # From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue), within 0.4 dB of the best weight on average.
 # They had 25 to 400 views, 500 to 100 000 photons a pixel, white noise and noise blurred by half a pixel.
 _SHARE = 0.75  # of the weight by the first volume
-_POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
-# Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many. It gives +1.0,
-# +0.7, -0.6 dB on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
+_MOST = 4.0  # times the first weight
+# Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-# Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
-# gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
-# band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
-_FOUND, _MOST_BY_FOUND = 1.75, 5.0
-_TOO_NOISY = 1.5  # times a model's residual: larger "noise" is fine structure
+_SETTLED = 3 / 8  # of the sweeps: OS-SIRT-TV with 3 of 40 ended a cement in a cone of 50 views 5.6 dB lower
 
 
 @dataclass(eq=False)
@@ -40,71 +32,64 @@ class NoiseBalance:
 
     It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its voxels of matter and σ the noise
     of a ray: as if each voxel's change were drawn from a Laplace distribution of the mean change. After each sweep it
-    is the first weight times (σ / s)³, at most four times it, where s is the noise-like part of the residual. It rises
-    where the residual has less noise than the data, since then the volume has taken it up. Rings and errors of the
-    geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So from sweep
-    `settled` on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, at most five times. Here s is the least so
-    far, so that the weight only falls.
+    is the first weight times (σ / s)², at least once and at most four times it, where s is the noise-like part of the
+    residual. It rises where the residual has less noise than the data, since then the volume has taken it up. Rings and
+    errors of the geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So
+    when three eighths of the sweeps are done, an s larger than σ takes its place: the weight is (s / σ)² times the
+    first one, at most four times. Here s is the least so far, so that the weight only falls.
 
     Attributes:
         first: the weight to begin with.
         noise: of a ray, with which the residual is compared: `noise_beside_structure` of the data. For many views it is
             up to 1.3 times that (π / 2 times the columns determine a slice). Then little of it fits into a volume.
-        settled: sweeps after which the residual is looked at. Before, a method that has not converged seems to leave
-            what no volume explains. Then the weight would be too heavy, and the residual large, up to the end.
+        sweeps: of the method. After three eighths of them the residual is looked at. Before, a method that has not
+            converged seems to leave what no volume explains. Then the weight would be too heavy, and the residual
+            large, up to the end.
     """
 
     first: float
     noise: float
-    settled: int = 3
+    sweeps: int
     value: float = field(init=False)
-    _sweeps: int = field(default=0, init=False)
+    _done: int = field(default=0, init=False)
     _least: float = field(default=math.inf, init=False)
 
     def __post_init__(self) -> None:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, evenly: bool = True) -> NoiseBalance:
+    def of(cls, problem: VoxelProblem, start: F32, sweeps: int, evenly: bool = True) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
-            modelled: the start is a model of the sample. Then what it leaves of the data bounds the noise, which fine
-                structure, or a scan of few rows, makes too large.
+            sweeps: of the method.
             evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
                 views is alike.
         """
         data = whitened(problem.data, problem.weight)
         noise = noise_beside_structure(data, problem.projector.geometry) if evenly else noise_level(data)
-        if modelled:
-            left = whitened(problem.data - problem.projector.forward_lines(start), problem.weight)
-            noise = min(noise, _TOO_NOISY * noise_level(left))
         first = problem.filtered("hann")
         volume = start if first is None else np.maximum(first, 0, out=first)
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
-        return cls(share, noise * _by_views(problem.projector.geometry))
+        return cls(share, noise * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
         """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""
-        self._sweeps += 1
+        self._done += 1
         deviation = median_deviation(residual)
         if not (deviation > 0 and self.noise > 0):
             return self.value
         self._least = min(self._least, deviation / self.noise)
-        factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
-        if self._sweeps >= self.settled and self._least > _EXPLAINED:
-            factor = min(1 + _FOUND**2 * (self._least**2 - _EXPLAINED**2), _MOST_BY_FOUND)
+        unexplained = self._done >= math.ceil(_SETTLED * self.sweeps) and self._least > 1
+        ratio = self._least if unexplained else self.noise / deviation
+        factor = float(np.clip(ratio**2, 1.0, _MOST))
         self.value = self.first * factor
         return self.value
 
 
-def determined(geometry: Geometry) -> float:
-    """The views over those that determine a slice, π / 2 a column; at most 1."""
-    return min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
-
-
 def _by_views(geometry: Geometry) -> float:
-    """Factor on the noise by the number of views."""
-    return 1 + _MANY_VIEWS * min(max(determined(geometry) / _HALF - 1, 0.0), 1.0)
+    """Factor on the noise by the number of views, over those that determine a slice: π / 2 a column."""
+    determined = min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
+    return 1 + _MANY_VIEWS * min(max(determined / _HALF - 1, 0.0), 1.0)

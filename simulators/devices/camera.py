@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Set
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,32 @@ POLL = 0.02  # s between looks at the trigger line while waiting: a stop may can
 TOLERANCE = 1e-6  # s: a trigger may come so early; a float64 of seconds since 1970 resolves 2e-7 s
 
 
+@dataclass(frozen=True)
+class OrcaQuestBuild:
+    """A simulated camera, and its faults.
+
+    Attributes:
+        pixel_pitch: mm at the sample of an unbinned sensor pixel.
+        ring_frames: frames that the ring holds; a reader who falls further behind loses the oldest.
+        lost: frames (numbered over the camera's life) that are exposed and then lost: a gap in the framestamps.
+        ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
+            numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
+        unplug_at: frame at which the camera is unplugged.
+        model: one of `drivers.orca_quest.LINE_TIMES`.
+    """
+
+    pixel_pitch: float = orca_quest.PITCH_MM
+    ring_frames: int = 128
+    lost: Set[int] = frozenset()
+    ignored: Set[int] = frozenset()
+    unplug_at: int | None = None
+    name: str = "camera"
+    model: str = orca_quest.MODEL
+
+
+_USUAL = OrcaQuestBuild()
+
+
 class SimulatedOrcaQuest:
     """Implements drivers.base.protocols.Camera.
 
@@ -43,13 +69,6 @@ class SimulatedOrcaQuest:
         scene: what stands in the beam.
         seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
         shutter, sample: looked at when a frame is exposed: dark, flat or projection.
-        pixel_pitch: mm at the sample of an unbinned sensor pixel.
-        ring_frames: frames that the ring holds; a reader who falls further behind loses the oldest.
-        lost: frames (numbered over the camera's life) that are exposed and then lost: a gap in the framestamps.
-        ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
-            numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
-        unplug_at: frame at which the camera is unplugged.
-        model: one of `drivers.orca_quest.LINE_TIMES`.
     """
 
     def __init__(
@@ -60,21 +79,13 @@ class SimulatedOrcaQuest:
         seed: int,
         shutter: BeamGate,
         sample: SampleGate,
-        *,
-        pixel_pitch: float = orca_quest.PITCH_MM,
-        ring_frames: int = 128,
-        lost: Set[int] = frozenset(),
-        ignored: Set[int] = frozenset(),
-        unplug_at: int | None = None,
-        name: str = "camera",
-        model: str = orca_quest.MODEL,
+        build: OrcaQuestBuild = _USUAL,
     ) -> None:
-        self.name, self._model = name, model
+        self.name, self._model = build.name, build.model
         self._scene, self._line, self._clock, self._seed = scene, line, clock, seed
-        self._shutter, self._sample, self._pitch, self._ring_frames = shutter, sample, pixel_pitch, ring_frames
-        self._lost, self._ignored, self._unplug_at = lost, ignored, unplug_at
+        self._shutter, self._sample, self._build = shutter, sample, build
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
-        self._timing = orca_quest.timing(self._settings, model=model)
+        self._timing = orca_quest.timing(self._settings, model=self._model)
         self._connected = clock.now()
         self._triggers = self._frames = self._views = 0  # over the camera's life
         self._ring: deque[Exposed] = deque()
@@ -216,7 +227,13 @@ class SimulatedOrcaQuest:
 
     def _camera_view(self) -> CameraView:
         return CameraView(
-            self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected, self._model
+            self._scene,
+            self._settings,
+            self._build.pixel_pitch,
+            self._seed,
+            self._line.angle_at,
+            self._connected,
+            self._model,
         )
 
     def _answer(self, armed: bool = False) -> None:
@@ -254,27 +271,28 @@ class SimulatedOrcaQuest:
     def _trigger(self, time: float, angle: float) -> None:
         """Expose for a trigger, unless a fault suppresses it."""
         number, self._triggers = self._triggers, self._triggers + 1
-        if self._gone or (number in self._ignored and self._settings.trigger is not TriggerSource.INTERNAL):
+        if self._gone or (number in self._build.ignored and self._settings.trigger is not TriggerSource.INTERNAL):
             return
         self._accepted = time
-        if self._unplug_at is not None and self._frames >= self._unplug_at:
+        if self._build.unplug_at is not None and self._frames >= self._build.unplug_at:
             self._gone = f"does not answer any more: it was unplugged at frame {self._frames}"
             return
         ready = time + self._settings.exposure + self._timing.readout
         beam, sample = self._shutter.is_open(), self._sample.is_in()
-        if self._frames not in self._lost:
+        if self._frames not in self._build.lost:
             self._ring.append(Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
         self._framestamp += 1
         self._frames += 1
         self._views += beam and sample
 
     def _check_overrun(self, now: float) -> None:
-        over = sum(frame.ready <= now for frame in self._ring) - self._ring_frames
+        over = sum(frame.ready <= now for frame in self._ring) - self._build.ring_frames
         if over > 0:
             gone = [self._ring.popleft().framestamp for _ in range(over)]
             raise DeviceError(
                 self.name,
-                f"its ring of {self._ring_frames} frames was overrun and {over} frames are lost: framestamps {gone}",
+                f"its ring of {self._build.ring_frames} frames was overrun and {over} frames are lost: framestamps "
+                f"{gone}",
                 advice="Take frames faster, trigger slower or use a larger ring",
                 state="Later frames can still be taken",
             )

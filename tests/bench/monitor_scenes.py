@@ -30,9 +30,8 @@ from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Shot, fixed_rng
 from simulators.samples.sample import Sample
-from simulators.scenes.expose import expose
+from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene, load_scene
-from simulators.scenes.shots import Scan
 
 ROWS, COLS, PITCH = 128, 512, 2.6  # um
 WIDTH, HEIGHT = COLS * PITCH * 1e-3, ROWS * PITCH * 1e-3

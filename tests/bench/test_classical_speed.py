@@ -17,7 +17,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
-from recon.voxels.iterative import solve
+from recon.voxels.iterative import Watch, solve
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -104,7 +104,7 @@ def test_quality_and_time_of_each_method(sample: str, shared_data: Path) -> None
     for method in methods:
         begin, worked = time.perf_counter(), time.process_time()
         curve: list[float] = []
-        volume = solve(method, projector, views, on_iteration=lambda _, r, curve=curve: curve.append(r))
+        volume = solve(method, projector, views, watch=Watch(lambda _, r, curve=curve: curve.append(r)))
         wall, busy = time.perf_counter() - begin, time.process_time() - worked
         steps = method.iterations
         print(

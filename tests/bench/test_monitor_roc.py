@@ -18,8 +18,8 @@ from beamline.monitor import watch
 from beamline.monitor.check import Flag, Level, ScanContext
 from drivers.base.frame import FrameKind
 from simulators.effects.jump import Jump
+from simulators.scenes.expose import Scan
 from simulators.scenes.scene import Scene
-from simulators.scenes.shots import Scan
 from tests.bench.monitor_scenes import (
     CLEAN,
     COLS,

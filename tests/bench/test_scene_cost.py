@@ -14,9 +14,8 @@ from beamline.simulate.scene_file import open_scene
 from simulators.effects.catalogue import CATALOGUE
 from simulators.frame.shot import Shot
 from simulators.scenes.explain import explain
-from simulators.scenes.expose import expose
+from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene
-from simulators.scenes.shots import Scan
 
 SIDE = 2048
 REPEATS = 7

@@ -20,7 +20,8 @@ from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
 GRID = recon.Grid((28, 32, 32), 0.04)
 ANGLES = np.arange(32) * 2 * np.pi / 32
-LIKE_OTHERS = "r2-published", "sax-nerf", "intratomo", "series"  # their rays are those of r2, naf and fista-tv
+# Their rays are those of r2, naf and fista-tv.
+LIKE_OTHERS = "r2-published", "sax-nerf", "intratomo", "series", "materials"
 SHORT = {
     "r2": {"steps": 60, "gaussians": 300, "finish": 4},
     "r2-published": {"steps": 60, "gaussians": 300},

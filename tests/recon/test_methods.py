@@ -41,7 +41,7 @@ def _first_steps() -> recon.RunControl:
     return recon.RunControl(should_stop=lambda: next(asked) >= 20)
 
 
-@pytest.mark.parametrize("name", [name for name in methods.names() if name not in (*FIELDS, methods.IN_TIME)])
+@pytest.mark.parametrize("name", [name for name in methods.names_of_one_volume() if name not in FIELDS])
 def test_a_method_by_name_is_the_method_by_object_to_the_bit(name: str, projections: NDArray[np.float32]) -> None:
     method = methods.by_name(name)
     by_name, by_object = (
@@ -67,7 +67,7 @@ def test_negative_densities_are_kept_where_they_are_allowed(name: str, projectio
 
 
 def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
-    positive = {"mlem", "osem", methods.IN_TIME}  # the iterations of the first two multiply
+    positive = {"mlem", "osem", "series", "materials"}  # the iterations of the first two multiply
     others = set(methods.names()) - set(methods.with_trait("direct")) - positive
     assert set(methods.taking("allow_negative")) == others
 
@@ -144,7 +144,9 @@ class TestConformance(MethodConformance):
         if request.param in FIELDS:
             request.getfixturevalue("one_thread")
             return methods.build(method, FIELDS[request.param])
-        if request.param == methods.IN_TIME:
-            return recon.TimeSeries(moves=False, sweeps=5, weight=0.01)
+        if request.param not in methods.names_of_one_volume():
+            return methods.build(
+                method, {"sweeps": 5, "weight": 0.01} | ({"moves": False} if request.param == methods.IN_TIME else {})
+            )
         short = {"iterations": 5, "steps": 40, "gaussians": 200, "finish": 2}
         return methods.build(method, {k: v for k, v in short.items() if methods.has_setting(method, k)})

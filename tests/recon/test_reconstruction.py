@@ -19,7 +19,7 @@ import recon.splatting.initialise
 from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
 from recon.axis_by_views import axis_by_views
-from recon.methods import IN_TIME, build, by_name, names
+from recon.methods import build, by_name, names_of_one_volume
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
@@ -119,6 +119,7 @@ def test_bad_settings_are_refused(method: type[R2], change: dict[str, object], m
 OF_A_FIT: dict[str, dict[str, object]] = {
     "held_out": {"use": DataUse(held_out=(3,))},
     "times": {"use": DataUse(times=np.arange(VIEWS.n_views, dtype=np.float64))},
+    "energies": {"use": DataUse(energies=recon.Energies(np.zeros(VIEWS.n_views, np.intp), np.ones((1, 1))))},
     "resume": {"control": RunControl(resume={})},
     "on_checkpoint": {"control": RunControl(on_checkpoint=print)},
     "device 'cuda'": {"device": "cuda"},
@@ -127,11 +128,11 @@ OF_A_FIT: dict[str, dict[str, object]] = {
 
 OF_FITS = r"\(of r2, r2-published\)"
 OF_MODELS = r"\(of r2, r2-published, naf, intratomo, sax-nerf\)"
-OWNERS = {"times": r"\(of series\)", "held_out": OF_MODELS, "device 'cuda'": OF_MODELS}
+OWNERS = {"times": r"\(of series\)", "energies": r"\(of materials\)", "held_out": OF_MODELS, "device 'cuda'": OF_MODELS}
 MODELS = "r2", "r2-published", "naf", "intratomo", "sax-nerf"
 
 
-@pytest.mark.parametrize("method", [name for name in names() if name not in (*MODELS, IN_TIME)])
+@pytest.mark.parametrize("method", [name for name in names_of_one_volume() if name not in MODELS])
 def test_no_argument_silently_does_nothing(noisy: np.ndarray, method: str) -> None:
     for name, argument in OF_A_FIT.items():
         with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} {OWNERS.get(name, OF_FITS)}"):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
-from beamline.storage.readers.nexus_geometry import differing
+from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.readers.stated import EXCHANGE, EXCHANGE_ENERGY_UNITS, EXCHANGE_LENGTH_UNITS, not_copied, not_used
 from beamline.storage.readers.turned import TurnedFrames, dimensions

@@ -32,8 +32,7 @@ from beamline.storage.readers.base import (
     frame_indices,
     read_known,
 )
-from beamline.storage.readers.nexus_geometry import differing, read_energy, read_geometry, require_order
-from beamline.storage.readers.nexus_places import choose, find
+from beamline.storage.readers.nexus import choose, differing, find, read_energy, read_geometry, require_order
 from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_copied, not_used
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in

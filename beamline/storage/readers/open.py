@@ -17,7 +17,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
-from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images

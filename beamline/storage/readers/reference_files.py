@@ -16,7 +16,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.dxchange import open_exchange
-from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.stacks import dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage import hdf5
-from beamline.storage.readers.nexus_places import Places, find
+from beamline.storage.readers.nexus import Places, find
 from beamline.storage.rules.finding import Finding
 from beamline.storage.writers import layout
 

@@ -25,9 +25,9 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import VIEWS, reference_groups, references_usable, some_of
+from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format

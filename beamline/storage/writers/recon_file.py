@@ -23,7 +23,7 @@ from beamline.storage.recon_record import ReconRecord as ReconRecord  # plug-ins
 from beamline.storage.recon_record import Value
 from beamline.storage.structure import require_harmless
 from beamline.storage.writer_lock import opened_whole
-from recon.base.volume import Grid, Volume, VolumesInTime
+from recon.base.volume import Grid, Volume, VolumeSeries
 
 DEFINITION = "NXtomoproc"
 FBP, DEVIATION = "fbp", "data_errors"
@@ -200,7 +200,7 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
     centre = tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x))
     stored, series = data["data"], None
     if at is not None:
-        series = VolumesInTime(np.asarray(data["time"][:]), stored)
+        series = VolumeSeries(np.asarray(data["time"][:]), stored)
         stored = series.each()[at]
     grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
     parameters = {name: _own_value(node) for name, node in process["parameters"].items()}

@@ -11,8 +11,18 @@ from fractions import Fraction
 
 from drivers.base.errors import DeviceRefused
 from drivers.stages.kept import FoundSettings
-from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_COMMAND, advice, meaning
-from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
+from drivers.stages.pi_gcs.line import (
+    ANY_NUMBER,
+    NOT_ALLOWED_TO_MOVE,
+    NUMBER,
+    REFUSALS,
+    UNKNOWN_COMMAND,
+    GcsLine,
+    advice,
+    is_rounding_of,
+    meaning,
+    plain,
+)
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
 from drivers.stages.shared import while_it_moves

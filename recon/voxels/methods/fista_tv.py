@@ -66,7 +66,7 @@ class FistaTv:
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
         if self.tv_weight is None:
-            weight = choose_weight(problem, x, modelled=False, trial=trial)
+            weight = choose_weight(problem, x, self.iterations, trial)
         else:
             share = self.tv_weight
             weight = problem.decide(

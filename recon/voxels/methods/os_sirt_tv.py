@@ -20,8 +20,6 @@ from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import on_volume, ordered_sweeps, weight_choice
 
-_SETTLED = 3 / 8  # of the sweeps: with 3 of 40, a cement in a cone of 50 views ended 5.6 dB lower
-
 
 @dataclass(frozen=True)
 class OsSirtTv:
@@ -66,9 +64,8 @@ class OsSirtTv:
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
             if self.tv_weight is None:
-                weight = weight or choose_weight(problem, x, modelled=False)
+                weight = weight or choose_weight(problem, x, self.iterations)
                 if isinstance(weight, NoiseBalance):
-                    weight.settled = max(weight.settled, int(_SETTLED * self.iterations))
                     weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
                 mu = weight.value if isinstance(weight, NoiseBalance) else weight
                 prox(x, float(mu * problem.decide("pace", lambda: sweeps.pace)))

@@ -85,7 +85,7 @@ class PnpDct:
         if sweeps:
             x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         else:
-            weight = choose_weight(problem, x, modelled=False, trial=trial)
+            weight = choose_weight(problem, x, self.first_sweeps, trial)
         if ended:
             return x
         share = self.patch_threshold

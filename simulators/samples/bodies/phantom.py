@@ -1,22 +1,164 @@
-"""Phantom: analytic solids with exact chord lengths, and their true attenuation on a grid."""
+"""Phantom: analytic solids with exact chord lengths, and their true attenuation and solids on a grid of voxels."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.chords import depths
-from simulators.samples.bodies.filling import add_attenuation, put_labels
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack
 from simulators.samples.bodies.solids import Solid, kind_of
 from simulators.samples.bodies.view import view_of
+
+Reals = NDArray[np.float64]
+Triple = tuple[float, float, float]
+
+_KERNEL = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False}  # as in chords
+
+
+@njit(**_KERNEL)
+def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, out: Reals) -> None:
+    """Add attenuation x filled share to `out`, float64 [z, y, x].
+
+    The share is counted on supersample³ points, only in voxels that a surface can cross.
+
+    Args:
+        corner: (z, y, x) of voxel (0, 0, 0)'s centre, mm.
+        edges: (z, y, x) of a voxel, mm.
+    """
+    far = 0.5 * math.sqrt(edges[0] ** 2 + edges[1] ** 2 + edges[2] ** 2)
+    for b in range(p.kind.size):
+        k0, k1, j0, j1 = _box(p, b, corner, edges, out.shape)
+        left = corner[2] - p.centre[b, 0]
+        for k in range(k0, k1):
+            z = corner[0] + k * edges[0] - p.centre[b, 2]
+            for j in range(j0, j1):
+                y = corner[1] + j * edges[1] - p.centre[b, 1]
+                first, stop = _line(p, b, y, z, far, left, edges[2], out.shape[2])
+                full, over = _line(p, b, y, z, -far, left, edges[2], out.shape[2])
+                for i in range(first, stop):
+                    if full <= i < over:
+                        out[k, j, i] += p.attenuation[b]
+                    else:
+                        share = _filled(p, b, left + i * edges[2], y, z, edges, supersample)
+                        out[k, j, i] += p.attenuation[b] * share
+
+
+@njit(**_KERNEL)
+def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Triple, out: NDArray[np.uint8]) -> None:
+    """Write label[solid] where a voxel's centre lies in a solid; later ones replace earlier ones.
+
+    `out` is uint8 [z, y, x]; corner and edges as for add_attenuation.
+    """
+    for b in range(p.kind.size):
+        k0, k1, j0, j1 = _box(p, b, corner, edges, out.shape)
+        left = corner[2] - p.centre[b, 0]
+        for k in range(k0, k1):
+            z = corner[0] + k * edges[0] - p.centre[b, 2]
+            for j in range(j0, j1):
+                y = corner[1] + j * edges[1] - p.centre[b, 1]
+                first, stop = _line(p, b, y, z, 0.0, left, edges[2], out.shape[2])
+                out[k, j, first:stop] = label[b]
+
+
+@njit(**_KERNEL)
+def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge: float, n: int) -> tuple[int, int]:
+    """Range of voxels of a line along x whose centres have a level <= limit; contiguous, since bodies are convex. In
+    closed form, then corrected by the level itself at both ends."""
+    low, high = -np.inf, np.inf
+    if p.kind[b] == CYLINDER:
+        radius = p.size[b, 0] + limit
+        square = radius * radius - y * y
+        if abs(z) > p.size[b, 1] + limit or radius < 0.0 or square < 0.0:
+            return 0, 0
+        low, high = -math.sqrt(square), math.sqrt(square)
+    elif p.kind[b] == ELLIPSOID:
+        W, radius = p.matrix[b], 1.0 + limit / p.size[b, 0]
+        aa = ad = dd = 0.0
+        for k in range(3):
+            a, d = W[k, 1] * y + W[k, 2] * z, W[k, 0]
+            aa, ad, dd = aa + a * a, ad + a * d, dd + d * d
+        square = ad * ad - dd * (aa - radius * radius)
+        if radius < 0.0 or square < 0.0:
+            return 0, 0
+        low, high = (-ad - math.sqrt(square)) / dd, (-ad + math.sqrt(square)) / dd
+    else:
+        for f in range(p.first_face[b], p.first_face[b + 1]):
+            slope = p.faces[f, 0]
+            rest = p.faces[f, 3] + limit - p.faces[f, 1] * y - p.faces[f, 2] * z
+            if slope > 0.0:
+                high = min(high, rest / slope)
+            elif slope < 0.0:
+                low = max(low, rest / slope)
+            elif rest < 0.0:
+                return 0, 0
+    first = math.ceil(min(max((low - left) / edge, 0.0), float(n)))
+    stop = math.floor(min(max((high - left) / edge, -1.0), n - 1.0)) + 1
+    while first > 0 and _level(p, b, left + (first - 1) * edge, y, z) <= limit:
+        first -= 1
+    while stop < n and _level(p, b, left + stop * edge, y, z) <= limit:
+        stop += 1
+    while first < stop and _level(p, b, left + first * edge, y, z) > limit:
+        first += 1
+    while first < stop and _level(p, b, left + (stop - 1) * edge, y, z) > limit:
+        stop -= 1
+    return first, max(first, stop)
+
+
+@njit(**_KERNEL)
+def _level(p: Packed, b: int, x: float, y: float, z: float) -> float:
+    """Negative inside, positive outside; its slope is 1 at most, so that it bounds the distance to the surface."""
+    if p.kind[b] == CYLINDER:
+        return max(math.sqrt(x * x + y * y) - p.size[b, 0], abs(z) - p.size[b, 1])
+    if p.kind[b] == ELLIPSOID:
+        W = p.matrix[b]
+        r2 = 0.0
+        for k in range(3):
+            w = W[k, 0] * x + W[k, 1] * y + W[k, 2] * z
+            r2 += w * w
+        return (math.sqrt(r2) - 1.0) * p.size[b, 0]
+    level = -np.inf
+    for f in range(p.first_face[b], p.first_face[b + 1]):
+        level = max(level, p.faces[f, 0] * x + p.faces[f, 1] * y + p.faces[f, 2] * z - p.faces[f, 3])
+    return level
+
+
+@njit(**_KERNEL)
+def _filled(p: Packed, b: int, x: float, y: float, z: float, edges: Triple, n: int) -> float:
+    """Share of n³ points, spread evenly over the voxel around (x, y, z), that lie inside."""
+    inside = 0
+    for k in range(n):
+        for j in range(n):
+            for i in range(n):
+                dx, dy, dz = ((i + 0.5) / n - 0.5) * edges[2], ((j + 0.5) / n - 0.5) * edges[1], ((k + 0.5) / n - 0.5)
+                if _level(p, b, x + dx, y + dy, z + dz * edges[0]) <= 0.0:
+                    inside += 1
+    return inside / n**3
+
+
+@njit(**_KERNEL)
+def _box(p: Packed, b: int, corner: Triple, edges: Triple, shape: tuple[int, int, int]) -> tuple[int, int, int, int]:
+    """Ranges of voxels along z and y that touch the box around the body."""
+    k0, k1 = _voxels(corner[0] - p.centre[b, 2], edges[0], p.extent[b, 2], shape[0])
+    j0, j1 = _voxels(corner[1] - p.centre[b, 1], edges[1], p.extent[b, 1], shape[1])
+    return k0, k1, j0, j1
+
+
+@njit(**_KERNEL)
+def _voxels(first: float, edge: float, reach: float, n: int) -> tuple[int, int]:
+    """Range of voxels that touch -reach..reach, the first voxel's centre being at `first`."""
+    low = max(0, math.floor((-reach - first) / edge + 0.5))
+    return low, max(low, min(n, math.floor((reach - first) / edge + 0.5) + 1))
+
 
 MOST_NAMES = 255  # labels are uint8, and 0 is air
 

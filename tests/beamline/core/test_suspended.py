@@ -6,8 +6,7 @@ import sys
 
 import pytest
 
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no Ctrl-Z")

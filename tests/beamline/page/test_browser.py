@@ -16,7 +16,7 @@ from beamline.scan.control import state_of
 from beamline.scan.states import State
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import write_reconstruction
-from recon.base.volume import VolumesInTime
+from recon.base.volume import VolumeSeries
 from tests.beamline.page.chromium import (
     BEAMLINE,
     MARKS,
@@ -125,7 +125,7 @@ def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
 def test_a_series_in_time_is_played(browser: Browser, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     volumes = np.stack([np.full((6, 8, 10), k, np.float32) for k in range(3)]) + rng.random((3, 6, 8, 10), np.float32)
-    series = VolumesInTime(np.array([0.0, 1.5, 3.0]), volumes)
+    series = VolumeSeries(np.array([0.0, 1.5, 3.0]), volumes)
     first = bare_record(tmp_path, volumes[0], (1.0, 1.0, 1.0))
     write_reconstruction(tmp_path / "series.h5", replace(first, series=series, parameters={"method": "series"}))
     with viewed(tmp_path / "series.h5") as page:

@@ -9,7 +9,7 @@ import pytest
 
 from beamline.cli import view as view_command
 from beamline.core.errors import DataError
-from beamline.page import slices
+from beamline.page import volume as volume_file
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume, grey_windows
 from beamline.storage.volumes.base import Pixels, bare_record
@@ -100,7 +100,7 @@ def test_a_large_volume_is_binned_across_y_and_x_alone(files: tuple[Path, Path, 
 def test_before_it_is_read_whole_the_nearest_slices_stand_for_others(
     files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slices, "_AT_ONCE", 0)
+    monkeypatch.setattr(volume_file, "_AT_ONCE", 0)
     volume = ShownVolume(files[0])
     expected = {1: [0] * 6, 2: [0, 0, 0, 4, 4, 4], 3: [0, 0, 2, 2, 4, 4]}  # slices read: those that are shown
     for n, shown in expected.items():
@@ -119,7 +119,7 @@ def test_before_it_is_read_whole_the_nearest_slices_stand_for_others(
 def test_the_page_of_a_volume_reads_the_rest_by_itself(
     files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slices, "_AT_ONCE", 0)
+    monkeypatch.setattr(volume_file, "_AT_ONCE", 0)
     with viewed(*files[:2]) as page:
         for _ in range(2 * SHAPE[0]):  # an answer comes after a slice that waits
             ready = [tile(page.ask(f"/api/slice/{which}/1/0")[2])[0]["ready"] for which in (0, 1)]
@@ -174,11 +174,11 @@ def test_no_slice_of_a_volume_with_scales_costs_more_than_a_bounded_read(
     scaled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     volume = ShownVolume(scaled)
-    monkeypatch.setattr(slices, "_READ", 0)
+    monkeypatch.setattr(volume_file, "_READ", 0)
     tile = volume.cut(2, 1444, TileRegion(0, 9999, 0, 9999))
     assert (tile.bin, tile.region) == (8, TileRegion(0, 40, 0, 600))
     np.testing.assert_allclose(tile.values, _mean(FINE, 8)[:, :, 180], atol=1e-6)
-    monkeypatch.setattr(slices, "_READ", 5 * 2**22)  # five chunks of 16 x 256 x 256
+    monkeypatch.setattr(volume_file, "_READ", 5 * 2**22)  # five chunks of 16 x 256 x 256
     assert volume.cut(2, 1444, TileRegion(0, 9999, 0, 9999)).bin > volume.cut(2, 1444, TileRegion(0, 40, 0, 100)).bin
     volume.close()
 

@@ -25,7 +25,7 @@ from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start, usual_step
 from beamline.projections.replay import context_of, judged_flags, replay, verdict
-from beamline.scan.recorder import Recorder
+from beamline.scan.recorder import Consequences, Recorder
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -113,7 +113,7 @@ def record(scan: Troubled, path: Path, preview_bin: int, pauses: tuple[float, ..
         writer.pauses = pauses
         recorder = Recorder(
             writer, start(scan.context()), FakeInstrument().timeline(), preview_bin=preview_bin, sink=events.append,
-            react=found.extend,
+            consequences=Consequences(found.extend),
         )  # fmt: skip
         for frame in scan.frames():
             recorder.put(frame)

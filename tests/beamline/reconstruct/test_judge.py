@@ -11,7 +11,7 @@ import pytest
 
 from beamline.cli.terminal import results
 from beamline.core.events import Event, VolumeDone
-from beamline.core.signals import StopOnSignal
+from beamline.core.stop import StopOnSignal
 from beamline.projections.selection import Selection
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions

@@ -20,7 +20,7 @@ from drivers.base.protocols import CameraSettings, Devices, TriggerSource
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures
-from simulators.devices.camera import SimulatedOrcaQuest
+from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
@@ -49,7 +49,13 @@ class FaultyInstrument:
         self.stage = PM16CStage(register(f"acquire-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
         self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
         self.camera = SimulatedOrcaQuest(
-            load_scene(SCENE), self.line, self.clock, 0, self.shutter, self.sample, lost=lost, ignored=ignored
+            load_scene(SCENE),
+            self.line,
+            self.clock,
+            0,
+            self.shutter,
+            self.sample,
+            OrcaQuestBuild(lost=lost, ignored=ignored),
         )
 
     def scan(self, stop: StopRequest, stop_after: int = 10**9) -> tuple[Acquisition, list[Frame], BaseException | None]:

@@ -23,7 +23,7 @@ from beamline.monitor.mass import MassCheck
 from beamline.monitor.watch import Monitor, start
 from beamline.scan import recorder as module
 from beamline.scan import run as run_module
-from beamline.scan.recorder import Recorder
+from beamline.scan.recorder import Consequences, Recorder
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -288,7 +288,7 @@ def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.Mo
 def test_views_with_a_warning_are_to_be_taken_again_where_the_check_is_named(checks: tuple[str, ...]) -> None:
     recorder = Recorder(
         Writer(), start(ScanContext(65535, 4, period=1.0)), TIMELINE, preview_bin=2, sink=lambda event: None,
-        retaken_warnings=frozenset(checks),
+        consequences=Consequences(retaken_warnings=frozenset(checks)),
     )  # fmt: skip
     for row in range(9):
         recorder.put(replace(frame(row), time=1.8e9 + row + (0.4 if row == 5 else 0.0)))

@@ -17,8 +17,7 @@ import pytest
 from beamline.api.instrument import Instrument
 from beamline.config.load import Config
 from beamline.core.errors import ScanStopped
-from beamline.core.signals import stop_signals
-from beamline.core.stop import StopRequest
+from beamline.core.stop import StopRequest, stop_signals
 from beamline.scan.control import Verb, ask, tell
 from beamline.scan.run import run_scan
 from beamline.scan.states import State, StateMachine

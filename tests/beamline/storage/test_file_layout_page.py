@@ -25,7 +25,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
-from recon.base.volume import Grid, VolumesInTime
+from recon.base.volume import Grid, VolumeSeries
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
@@ -147,7 +147,7 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     record = read_reconstruction(tmp_path / "bars.h5")
     assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
     write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
-    series = VolumesInTime(np.zeros(2), np.stack([record.volume.data] * 2))
+    series = VolumeSeries(np.zeros(2), np.stack([record.volume.data] * 2))
     write_reconstruction(tmp_path / "series.h5", replace(record, series=series))
     volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful", "series")))
     assert unmatched(volumes, names("Volume file")) == (set(), set())

@@ -11,20 +11,20 @@ from pathlib import Path
 import pytest
 
 from drivers.base.errors import DeviceError
-from drivers.dcam import abi, codes, structures
+from drivers.dcam import abi, codes
 from tests.drivers.dcam.fake import compiler
 
 STRUCTURES = {
-    "DCAMDEV_CAPABILITY": structures.DevCapability,
-    "DCAMAPI_INIT": structures.ApiInit,
-    "DCAMDEV_OPEN": structures.DevOpen,
-    "DCAMDEV_STRING": structures.DevString,
-    "DCAMPROP_ATTR": structures.PropAttr,
-    "DCAM_TIMESTAMP": structures.TimeStamp,
-    "DCAMCAP_TRANSFERINFO": structures.TransferInfo,
-    "DCAMBUF_FRAME": structures.BufFrame,
-    "DCAMWAIT_OPEN": structures.WaitOpen,
-    "DCAMWAIT_START": structures.WaitStart,
+    "DCAMDEV_CAPABILITY": codes.DevCapability,
+    "DCAMAPI_INIT": codes.ApiInit,
+    "DCAMDEV_OPEN": codes.DevOpen,
+    "DCAMDEV_STRING": codes.DevString,
+    "DCAMPROP_ATTR": codes.PropAttr,
+    "DCAM_TIMESTAMP": codes.TimeStamp,
+    "DCAMCAP_TRANSFERINFO": codes.TransferInfo,
+    "DCAMBUF_FRAME": codes.BufFrame,
+    "DCAMWAIT_OPEN": codes.WaitOpen,
+    "DCAMWAIT_START": codes.WaitStart,
 }
 # Bytes on 64-bit machines, as the vendor's header and two independent bindings have them.
 SIZES = {
@@ -47,13 +47,13 @@ def test_size_is_the_published_one(name: str) -> None:
 
 
 def test_stamps_lie_where_the_vendor_puts_them() -> None:
-    frame = structures.BufFrame
+    frame = codes.BufFrame
     assert (frame.buffer.offset, frame.timestamp.offset, frame.framestamp.offset) == (16, 48, 56)
 
 
 def test_layout_is_that_of_a_c_compiler(world) -> None:
     c_layout = world.layout()
-    declared = {value for value in vars(structures).values() if isinstance(value, type(ctypes.Structure))}
+    declared = {value for value in vars(codes).values() if isinstance(value, type(ctypes.Structure))}
     assert set(STRUCTURES.values()) == declared  # none is left out
     assert set(c_layout) == set(STRUCTURES)
     for name, structure in STRUCTURES.items():
@@ -135,4 +135,4 @@ def test_a_wrong_size_field_is_seen_by_the_library(world) -> None:
     """The fake checks sizes as the real one does; that the other tests pass therefore means something."""
     library = ctypes.CDLL(str(world.path))
     library.dcamapi_init.restype = ctypes.c_int32
-    assert library.dcamapi_init(ctypes.byref(structures.ApiInit(size=8))) & 0xFFFFFFFF == codes.Error.INVALIDPARAM
+    assert library.dcamapi_init(ctypes.byref(codes.ApiInit(size=8))) & 0xFFFFFFFF == codes.Error.INVALIDPARAM

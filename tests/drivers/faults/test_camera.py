@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from beamline.config.devices import DcamOrca
-from beamline.doctor import camera as doctor
+from beamline.doctor import devices as doctor
 from beamline.doctor.check import Grade
 from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import LONGEST_REPLY, Framing
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
@@ -47,8 +47,10 @@ class Script:
 
 
 def connect(wire: Any, **settings: Any) -> SerialLine:
-    usual: dict[str, Any] = {"framing": GCS, "timeout": 1.0, "baudrate": 9600, "probe": Probe("ID?", "me")}
-    return SerialLine(register(next(NAMES), wire), device="script", clock=wire.clock, **(usual | settings))
+    of_line = {name: settings.pop(name) for name in ("timeout", "transcript") if name in settings}
+    rules = LineRules(**({"framing": GCS, "probe": Probe("ID?", "me")} | settings))
+    usual: dict[str, Any] = {"timeout": 1.0, "baudrate": 9600, "device": "script"}
+    return SerialLine(register(next(NAMES), wire), rules, wire.clock, **(usual | of_line))
 
 
 # ends of lines
@@ -244,9 +246,9 @@ def test_a_port_that_does_not_open_leaves_no_transcript_open(tmp_path: Path) -> 
     with pytest.raises(DeviceError, match="does not open"):
         SerialLine(
             "sim://nobody",
+            LineRules(Probe("", "")),
+            VirtualClock(),
             device="d",
-            probe=Probe("", ""),
-            clock=VirtualClock(),
             timeout=1.0,
             baudrate=1,
             transcript=path,

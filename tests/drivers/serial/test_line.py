@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine
 from drivers.serial.line_reader import RECENT_LINES
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
@@ -51,12 +51,11 @@ class Echo:
 def connect(echo: Echo, timeout: float = 1.0) -> SerialLine:
     return SerialLine(
         register(next(NAMES), echo),
+        LineRules(Probe("ID?", "ECHO"), unsolicited="STOP[0-9A-F]"),
+        echo.clock,
         device="echo",
-        probe=Probe("ID?", "ECHO"),
-        clock=echo.clock,
         timeout=timeout,
         baudrate=9600,
-        unsolicited="STOP[0-9A-F]",
     )
 
 
@@ -284,7 +283,7 @@ def test_only_the_last_lines_are_told_and_long_ones_are_cut() -> None:
 @pytest.mark.parametrize("url", ["sim://nobody", "nonsense://x", "/no/such/port", "socket://127.0.0.1:1"])
 def test_a_port_that_does_not_open_is_named(url: str) -> None:
     with pytest.raises(DeviceError, match="does not open") as error:
-        SerialLine(url, device="d", probe=Probe("ID?", ""), clock=SystemClock(), timeout=0.1, baudrate=9600)
+        SerialLine(url, LineRules(Probe("ID?", "")), SystemClock(), device="d", timeout=0.1, baudrate=9600)
     assert url in str(error.value)
     assert "Nothing was sent" in str(error.value)
 

@@ -19,7 +19,7 @@ import serial
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import LineRules, Probe, SerialLine
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
 from simulators.wires.wire import Wire
@@ -50,8 +50,8 @@ class Answers:
 
 
 def connect(url: str, clock: Any, **settings: Any) -> SerialLine:
-    usual: dict[str, Any] = {"timeout": 5.0, "baudrate": 9600, "probe": Probe("ID?", "1"), "device": "echo"}
-    return SerialLine(url, clock=clock, **(usual | settings))
+    usual: dict[str, Any] = {"timeout": 5.0, "baudrate": 9600, "device": "echo"}
+    return SerialLine(url, LineRules(Probe("ID?", "1")), clock, **(usual | settings))
 
 
 @pytest.mark.parametrize("serve", [pytest.param(serve_pty, marks=needs_pty), serve_tcp])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError
-from drivers.serial.line import QUIET, Probe, SerialLine
+from drivers.serial.line import QUIET, LineRules, Probe, SerialLine
 from drivers.serial.line_reader import Framing
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
@@ -61,14 +61,11 @@ def test_fuzz_every_call_ends_in_time_and_the_line_finds_its_step_again(
     wire = FuzzedWire(Numbered(framing), plan)
     line = SerialLine(
         register(next(NAMES), wire),
+        LineRules(Probe("ID?", "me"), unsolicited="!.*", framing=framing, check=no_x if checked else lambda line: ""),
+        wire.clock,
         device="fuzzed",
-        probe=Probe("ID?", "me"),
-        clock=wire.clock,
         timeout=TIMEOUT,
         baudrate=9600,
-        unsolicited="!.*",
-        framing=framing,
-        check=no_x if checked else lambda line: "",
     )
     for number, call in enumerate(calls):
         if call < len(FORMS):

@@ -9,7 +9,7 @@ from uuid import uuid4
 
 import pytest
 
-from beamline.config.found_settings import FoundOnDisk, file_of
+from beamline.config.stages import FoundOnDisk, file_of
 from drivers.base.protocols import RotationStage
 from drivers.stages.epics.settings import EpicsSettings
 from drivers.stages.epics.stage import EpicsStage

@@ -23,7 +23,7 @@ BOX = Grid((20, 20, 20)).edges
 def _control(g: Gaussians, statistic: np.ndarray, policy: DensityPolicy, limit: int = 1000) -> Change:
     rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
     return control(
-        g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), statistic.astype(np.float32),
+        (g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy()), statistic.astype(np.float32),
         policy, FIELD, limit, BOX, np.random.default_rng(1),
     )  # fmt: skip
 
@@ -96,7 +96,7 @@ def test_the_box_may_lie_anywhere() -> None:
     box = Grid((6, 10, 20), centre=(-1.5, 0.0, 4.0)).edges  # x -6..14, y -5..5, z -4.5..1.5
     rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
     change = control(
-        g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), np.zeros(4, np.float32),
+        (g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy()), np.zeros(4, np.float32),
         DensityPolicy(), FIELD, 10, box, np.random.default_rng(1),
     )  # fmt: skip
     assert change.keep.tolist() == [0, 2, 3]

@@ -25,8 +25,8 @@ def _change(g: Gaussians, large: float) -> Change:
     rotations = rotation_matrices(g.quaternions).reshape(-1, 9).numpy()
     policy = DensityPolicy(large=large, rule="published")
     return control(
-        g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy(), np.ones(g.n, np.float32), policy,
-        FIELD, 10 * g.n, Grid((20, 20, 20)).edges, np.random.default_rng(1),
+        (g.means.numpy(), g.log_scales.numpy(), rotations, g.raw_densities.numpy()), np.ones(g.n, np.float32),
+        policy, FIELD, 10 * g.n, Grid((20, 20, 20)).edges, np.random.default_rng(1),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import Camera, CameraFrame, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
-from simulators.devices.camera import SimulatedOrcaQuest
+from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import Pulse, TriggerLine
@@ -47,7 +47,9 @@ class _Bench:
                 "axis_offset_px": axis_offset_px,
             }
         )
-        self.camera = SimulatedOrcaQuest(self.scene, self.line, self.clock, 5, self.shutter, self.sample, **options)
+        self.camera = SimulatedOrcaQuest(
+            self.scene, self.line, self.clock, 5, self.shutter, self.sample, OrcaQuestBuild(**options)
+        )
         self.camera.configure(SETTINGS)
 
     def fire(self, n: int, *, angle: float = 0.0, period: float = 0.05) -> list[float]:
@@ -159,7 +161,7 @@ def test_axis_and_pitch_follow_offset_roi_and_binning() -> None:
         assert 1944 + (column + 0.5) * binning - 0.5 == pytest.approx(4095 / 2 + 3.5 + u, abs=0.2)
         assert frame.counts.max() == pytest.approx(FULL / 16 * binning**2, abs=1)
     assert SimulatedOrcaQuest(
-        bench.scene, bench.line, bench.clock, 5, bench.shutter, bench.sample, pixel_pitch=6.5e-4
+        bench.scene, bench.line, bench.clock, 5, bench.shutter, bench.sample, OrcaQuestBuild(pixel_pitch=6.5e-4)
     ).detector.pitch == pytest.approx(6.5e-4)
 
 

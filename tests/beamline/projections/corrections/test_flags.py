@@ -17,7 +17,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.rules.flags import FEWEST_VIEWS
+from beamline.storage.rules.treatment import FEWEST_VIEWS
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 

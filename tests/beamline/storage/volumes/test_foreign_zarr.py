@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.page.slices import CopiedSlices, ScaledSlices, TileRegion, _bytes_read, slices_of
+from beamline.page.volume import CopiedSlices, ScaledSlices, TileRegion, _bytes_read, slices_of
 from beamline.storage.foreign_zarr import ZarrScale, open_zarr
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Cylinder, Ellipsoid
-from tests.simulators.bodies import SOLIDS
+from simulators.samples.bodies.solids import SOLIDS as KINDS
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, kind_of
+from tests.simulators.bodies import SOLIDS, inside, volume
 
 
 def _widest_shadow(phantom: Phantom, detector: Detector) -> float:
@@ -33,3 +36,92 @@ def test_the_radius_is_of_the_farthest_solid_and_0_without_solids() -> None:
     assert Phantom.of([can]).radius == 0.5  # not the corner of the box around it
     assert Phantom.of([can, Ellipsoid((0.1, 0.1, 0.1), 1.0, (3.0, 4.0, 0.0))]).radius == pytest.approx(5.1)
     assert Phantom.of([]).radius == 0.0
+
+
+def _centres(grid: Grid) -> NDArray[np.float64]:
+    """(x, y, z) of voxels' centres, [z, y, x, 3]."""
+    return np.stack(np.meshgrid(*grid.coordinates(), indexing="ij")[::-1], axis=-1)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_truth_has_the_solid_s_mass(name: str) -> None:
+    solid = SOLIDS[name]
+    grid = Grid((50, 56, 60), 0.018, centre=(0.02, -0.03, 0.04))
+    truth = Phantom.of([solid]).attenuation(grid, supersample=4)
+    assert truth.dtype == np.float32
+    mass = truth.sum(dtype=np.float64) * grid.voxel_size**3
+    # Faces along the voxels all fall between the same two sub-points: each edge is out by up to one sub-step.
+    tolerance = {"upright box": sum(0.018 / 4 / edge for edge in (0.5, 0.3, 0.4)), "upright plate": 0.018 / 4 / 0.15}
+    assert mass == pytest.approx(solid.attenuation * volume(solid), rel=tolerance.get(name, 3e-3))
+    sure = (truth == 0) | (truth == np.float32(solid.attenuation))
+    np.testing.assert_array_equal(truth[sure] > 0, inside(solid, _centres(grid))[sure])
+
+
+def test_truth_of_all_together_has_the_mass_of_all() -> None:
+    """Upright faces lie midway between the points that are counted, but for those of a hexagon."""
+    solids = [solid for name, solid in SOLIDS.items() if name != "upright plate"]
+    grid = Grid((30, 34, 32), 0.03)
+    mass = Phantom.of(solids).attenuation(grid, supersample=6).sum(dtype=np.float64) * grid.voxel_size**3
+    assert mass == pytest.approx(sum(solid.attenuation * volume(solid) for solid in solids), rel=1e-3)
+
+
+def test_truth_on_a_face_is_the_filled_share() -> None:
+    grid = Grid((1, 1, 8), 1.0)  # x at -3.5 ... 3.5
+    truth = Phantom.of([Box((5.0, 9.0, 9.0), 4.0)]).attenuation(grid, supersample=2)
+    np.testing.assert_allclose(truth[0, 0], [0, 2, 4, 4, 4, 4, 2, 0])
+
+
+def test_truth_and_labels_of_tall_voxels() -> None:
+    """Slices twice as far apart as voxels are wide: the same as every other slice where nothing changes along z."""
+    phantom = Phantom.of([Cylinder(0.3, 0.8, 1.0), Box((0.2, 0.2, 0.4), 1.0, (0.1, 0.0, 0.1))])
+    tall = Grid((10, 40, 40), 0.02, slice_pitch=0.08)
+    np.testing.assert_allclose(
+        phantom.attenuation(tall, supersample=4).sum() * 0.02**2 * 0.08, np.pi * 0.09 * 0.8 + 0.016, rtol=3e-3
+    )
+    expected = np.where(inside(phantom.solids[1], _centres(tall)), 2, inside(phantom.solids[0], _centres(tall)) * 1)
+    np.testing.assert_array_equal(phantom.labels(tall), expected)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_a_label_names_the_solid_at_the_voxels_centre(name: str) -> None:
+    grid = Grid((40, 44, 48), 0.021, centre=(0.02, -0.03, 0.04))
+    labels = Phantom.of([SOLIDS[name]]).labels(grid)
+    assert labels.dtype == np.uint8
+    np.testing.assert_array_equal(labels == 1, inside(SOLIDS[name], _centres(grid)))
+    assert 0 < labels.sum() == (labels > 0).sum()
+
+
+def test_later_solids_lie_over_earlier_ones() -> None:
+    can, bore, liquid = Cylinder(0.4, 0.6, 2.0), Cylinder(0.3, 0.6, -2.0), Cylinder(0.3, 0.6, 0.5)
+    ball, hole = Ellipsoid((0.15, 0.15, 0.15), 1.0), Ellipsoid((0.05, 0.05, 0.05), -1.0)
+    grid = Grid((1, 1, 9), 0.1)  # x at -0.4 ... 0.4
+    full = Phantom.of([can, bore, liquid, ball, hole], names=["wall", "wall", "liquid", "grain", "pore"])
+    assert full.names == ("wall", "liquid", "grain", "pore")
+    np.testing.assert_array_equal(full.labels(grid)[0, 0, [0, 2, 3, 4, 5, 6, 8]], [1, 2, 3, 4, 3, 2, 1])
+
+
+def test_solids_may_share_a_name() -> None:
+    balls = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (x, 0.0, 0.0)) for x in (-0.3, 0.0, 0.3)]
+    phantom = Phantom.of(balls, names=["a", "b", "a"])
+    assert phantom.names == ("a", "b")
+    np.testing.assert_array_equal(phantom.labels(Grid((1, 1, 3), 0.3))[0, 0], [1, 2, 1])
+    assert Phantom.of(list(SOLIDS.values())).names == tuple(dict.fromkeys(map(kind_of, SOLIDS.values())))
+    assert set(Phantom.of(list(SOLIDS.values())).names) == set(KINDS)
+
+
+def test_names_that_do_not_fit_are_refused() -> None:
+    ball = Ellipsoid((0.1, 0.1, 0.1), 1.0)
+    with pytest.raises(ValueError, match="3 solids have 2 names; give each solid a name, or none"):
+        Phantom.of([ball] * 3, names=["a", "b"])
+    Phantom.of([ball] * 255, names=[f"grain {i}" for i in range(255)])
+    with pytest.raises(ValueError, match="at most 255 names, got 256; let solids share"):
+        Phantom.of([ball] * 256, names=[f"grain {i}" for i in range(256)])
+
+
+def test_solids_outside_the_grid() -> None:
+    far = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
+    assert not Phantom.of(far).attenuation(Grid((8, 8, 8), 0.02)).any()
+    assert not Phantom.of(far).labels(Grid((8, 8, 8), 0.02)).any()
+    wide = Phantom.of([Cylinder(3.0, 9.0, 1.0)])
+    assert wide.attenuation(Grid((2, 2, 2), 0.02)).min() == 1.0
+    assert wide.labels(Grid((2, 2, 2), 0.02)).min() == 1

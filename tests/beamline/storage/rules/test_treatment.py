@@ -12,7 +12,7 @@ from beamline.projections.corrections.flags import usable_views
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.flags import frames_flagged
+from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.validate import validate
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 

@@ -10,8 +10,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.storage.mesh_reader import read_mesh
-from beamline.storage.writers.mesh_file import write_mesh
+from beamline.storage.mesh_file import read_mesh, write_mesh
 from recon.post.surface import Mesh
 from tests.simulators.samples.voxels.test_mesh import sphere
 

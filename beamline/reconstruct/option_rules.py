@@ -1,0 +1,156 @@
+"""Rules of a reconstruction's options: whose they are, what they do not go with, what they need.
+
+They hold on the command line, in a recipe and in Python, with the same sentence. An option is named by its long name,
+without dashes. This module loads nothing that computes, so that help is quick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from recon.base.choices import AUTO
+
+
+@dataclass(frozen=True)
+class OptionRule:
+    """What an option is of, and what it goes with.
+
+    Attributes:
+        setting: of the methods with this setting, by its path in Python, such as `fit.loss`.
+        trait: of the methods with this trait, where the option is no setting of theirs.
+        inverted: it is a flag that switches the setting off.
+        value: of `ReconOptions`, by its path, that it gives.
+        excludes: what does not go with it, and why.
+        needs: another option, without which this one means nothing, and the end of the sentence that says so.
+    """
+
+    setting: str = ""
+    trait: str = ""
+    inverted: bool = False
+    value: str = ""
+    excludes: Mapping[str, str] = field(default_factory=dict)
+    needs: tuple[str, str] | None = None
+
+    @property
+    def of_methods(self) -> bool:
+        """Only some methods take it."""
+        return bool(self.setting or self.trait)
+
+
+AXIS_TRIALS, SLABS = "axis try", "resume of slabs"
+"""Values of options that have rules of their own: several axes to try, and a partial volume to go on from."""
+
+_FINISHED = {"follow": "it is for a finished scan"}
+_BY_BUDGET = {"budget": "--budget chooses it"}
+_PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
+_BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
+_RUNNING = ("follow", "is for a scan that still runs: give --follow.")
+_IN_MEMORY = dict.fromkeys(("follow", "budget"), "it holds everything in memory")
+_PICTURE = {AXIS_TRIALS: "that writes a picture of slices, and nothing else"}
+_FOR_TIME = dict.fromkeys(
+    ("follow", "budget", "seconds", AXIS_TRIALS), "refits need the whole scan, and time of their own"
+)
+
+RULES: Mapping[str, OptionRule] = {
+    "steps": OptionRule("steps", excludes={"seconds": "give one of them", **_PLANNED}),
+    "seconds": OptionRule("seconds", excludes=_PLANNED),
+    "budget": OptionRule(trait="budget", value="budget", excludes={"quality": "give one of them", **_BY_SECONDS}),
+    "quality": OptionRule(trait="presets", value="quality", excludes=_BY_SECONDS),
+    "gaussians": OptionRule("gaussians", excludes=_PLANNED),
+    "start": OptionRule("start", excludes={**_BY_BUDGET, **_FINISHED}),
+    "loss": OptionRule("fit.loss", excludes=_BY_BUDGET),
+    "kernel": OptionRule("fit.kernel", excludes=_BY_BUDGET),
+    "device": OptionRule(trait="device", value="device", excludes={**_BY_BUDGET, **_FINISHED}),
+    "early-stop": OptionRule("early_stop", excludes={**_BY_BUDGET, **_FINISHED}),
+    "finish": OptionRule("finish", excludes={**_PLANNED, **_FINISHED}),
+    "checkpoint": OptionRule(trait="checkpoints", value="checkpoints.path", excludes={**_BY_BUDGET, **_FINISHED}),
+    "resume": OptionRule(trait="checkpoints", value="checkpoints.resume", excludes={**_BY_BUDGET, **_FINISHED}),
+    "iterations": OptionRule("iterations", excludes=_BY_BUDGET),
+    "tv-weight": OptionRule("tv_weight"),
+    "patch-threshold": OptionRule("patch_threshold"),
+    "allow-negative": OptionRule("allow_negative", excludes=_FINISHED),
+    "time": OptionRule(
+        "volumes",
+        excludes={
+            **_FINISHED,
+            AXIS_TRIALS: "find the axis first: give --axis try without --time, then its column with --time",
+            "roi": "a box is of one volume",
+            "truth": "a truth is compared with one volume",
+            "uncertainty": "error bars are of one volume",
+            "cluster": "volumes in time are not made in slabs",
+        },
+    ),
+    "moves": OptionRule("moves", needs=("time", "is of volumes in time: give --time N with it.")),
+    "plain-splatting": OptionRule("fit.rays.rectified", inverted=True, excludes=_BY_BUDGET),
+    "uncertainty": OptionRule(value="uncertainty", excludes=_FOR_TIME),
+    "truth": OptionRule(value="truth"),
+    "follow": OptionRule(excludes={SLABS: "these slabs are of a finished scan", AXIS_TRIALS: "they need all views"}),
+    "earlier": OptionRule(needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts.")),
+    "enough-loss": OptionRule(value="enough.psnr_loss", needs=_RUNNING),
+    "enough-gain": OptionRule(value="enough.psnr_gain_per_10_views", needs=_RUNNING),
+    "unfinished": OptionRule(value="unfinished"),
+    "memory": OptionRule(value="memory", excludes=_IN_MEMORY),
+    "cluster": OptionRule(value="cluster", excludes=_IN_MEMORY),
+    "roi": OptionRule(
+        value="region",
+        excludes={
+            "follow": "it is for a finished scan",
+            "truth": "a truth is compared with the whole volume",
+            AXIS_TRIALS: "they draw whole slices",
+        },
+    ),
+    "log": OptionRule(excludes=_PICTURE),
+    "dry-run": OptionRule(
+        excludes={"follow": "a scan that runs takes its own time", "budget": "it says the time itself", **_PICTURE}
+    ),
+    SLABS: OptionRule(value="partial"),
+}
+"""By the option's name, in the order in which they are looked at."""
+
+
+def takers(rule: OptionRule) -> tuple[str, ...]:
+    """Names of the methods that take an option of methods."""
+    from recon.methods import taking, with_trait  # here: not every command needs methods
+
+    if rule.setting:
+        return taking(rule.setting)
+    from recon.auto import Auto  # here, because it loads all methods
+
+    return (*((AUTO,) if getattr(Auto.traits, rule.trait) else ()), *with_trait(rule.trait))
+
+
+def contradiction(
+    rules: Mapping[str, OptionRule],
+    given: Collection[str],
+    shown: Mapping[str, str] = MappingProxyType({}),
+    *,
+    one_method: bool = False,
+) -> str:
+    """Why options do not go together, or one lacks another that it needs; "" where they do.
+
+    Args:
+        rules: of all options, by name.
+        given: names of the options that somebody gave.
+        shown: what the sentence calls some of them; the others by their names.
+        one_method: settings are of a method that was made with all of them, and says itself what they mean together.
+    """
+    for name in (name for name in rules if name in given):
+        text = shown.get(name, f"--{name}")
+        for other, why in rules[name].excludes.items():
+            both_settings = rules[name].setting and other in rules and rules[other].setting
+            if other in given and not (one_method and both_settings):
+                return f"{text} does not go with {shown.get(other, f'--{other}')}: {why}. Nothing was computed."
+        needs = rules[name].needs
+        if needs is not None and needs[0] not in given:
+            return f"{text} {needs[1]}"
+    return ""
+
+
+def of_other_methods(rules: Mapping[str, OptionRule], given: Collection[str], method: str) -> str:
+    """Which option given is of other methods than this one; "" where none is."""
+    for name in (name for name, rule in rules.items() if name in given and rule.of_methods):
+        if method not in (owners := takers(rules[name])):
+            return f"--{name} is of {', '.join(owners)}; it does not go with --method {method}."
+    return ""

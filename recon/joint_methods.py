@@ -1,0 +1,263 @@
+"""Methods of several volumes that all views determine together: at times of a scan, or of each material."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.volume import Grid, Volume, VolumeSeries
+from recon.base.work import Costs
+from recon.energy_fit import EnergyViews
+from recon.series import SWEEPS, TimedViews, fit_series, series_costs
+from recon.share_fit import STEPS, fit_share
+from recon.spectral import MATERIAL_SWEEPS, fit_materials, material_costs
+
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
+_OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
+_COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
+
+
+@dataclass(frozen=True)
+class TimeSeries:
+    """Volumes at even times of one scan of a sample that changes, see `fit_series`.
+
+    Attributes:
+        volumes: 2 or more, from the first view to the last; each needs twelve views or more.
+        moves: matter moves, and not only its density changes; None: what views held out prefer.
+        sweeps: of the fit.
+        weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
+
+    Raises:
+        ValueError: other values.
+    """
+
+    name: ClassVar[str] = "series"
+    label: ClassVar[str] = "Volumes in time"
+    traits: ClassVar[Traits] = Traits(in_time=True)
+
+    volumes: int = 2
+    moves: bool | None = None
+    sweeps: int = SWEEPS
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.volumes, bool) or not isinstance(self.volumes, int) or self.volumes < 2:
+            raise ValueError(f"volumes must be a whole number, 2 or more, got {self.volumes!r}")
+        _require_fit(self.sweeps, self.weight)
+
+    @property
+    def volume_names(self) -> tuple[str, ...]:
+        return ()
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        _require_own_grid(problem)
+        n, times = problem.geometry.n_views, problem.use.times
+        times = np.arange(n, dtype=np.float64) if times is None else times
+        history = _History(self.sweeps, n, control)
+        data, weights = _measured(problem)
+        made = fit_series(
+            TimedViews(data, problem.geometry, times, weights),
+            self.volumes,
+            motion=self.moves,
+            tv_weight=self.weight,
+            sweeps=self.sweeps,
+            seed=problem.seed,
+            go_on=history.heard,
+            stop=history.stopped,
+        )
+        series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
+        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
+        settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
+        if made.unseen_residuals is not None:
+            settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
+        return history.result(series, made.grid, settings)
+
+    def toy(self) -> Self:
+        return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+
+
+@dataclass(frozen=True)
+class EnergySeries:
+    """A volume of each material, from views of one sample at several energies, see `fit_materials`.
+
+    Attributes:
+        materials: their names, one for each column of `Energies.cross_sections`.
+        states: names of two of them that are two states of the same one, so that the share of the second is smooth
+            within matter, see `fit_share`; empty: no such pair.
+        sweeps: of the fit.
+        weight: of total variation, `tv_weight` of `fit_materials`; None: what views held out prefer.
+
+    Raises:
+        ValueError: other values.
+    """
+
+    name: ClassVar[str] = "materials"
+    label: ClassVar[str] = "Materials"
+    traits: ClassVar[Traits] = Traits(by_energy=True)
+
+    materials: tuple[str, ...] = ("matter",)
+    states: tuple[str, ...] = ()
+    sweeps: int = MATERIAL_SWEEPS
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "materials", tuple(self.materials))
+        object.__setattr__(self, "states", tuple(self.states))
+        if not self.materials or len(set(self.materials)) < len(self.materials):
+            raise ValueError(f"materials must be names that differ, got {', '.join(self.materials) or 'none'}")
+        two = len(self.states) == 2 and len(set(self.states) & set(self.materials)) == 2
+        if self.states and not two:
+            raise ValueError(
+                f"states are {','.join(self.states)}: expected two of the materials {', '.join(self.materials)}"
+            )
+        _require_fit(self.sweeps, self.weight)
+
+    @property
+    def volumes(self) -> int:
+        return len(self.materials)
+
+    @property
+    def volume_names(self) -> tuple[str, ...]:
+        return self.materials
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        _require_own_grid(problem)
+        n = problem.geometry.n_views
+        energies = problem.use.energies or Energies(np.zeros(n, np.intp), np.ones((1, 1)))
+        if energies.cross_sections.shape[1:] != (self.volumes,):
+            raise ValueError(
+                f"cross_sections have shape {energies.cross_sections.shape}; expected a column for each of "
+                f"{', '.join(self.materials)}"
+            )
+        data, weights = _measured(problem)
+        views = EnergyViews(data, problem.geometry, energies.of_view, energies.cross_sections, weights)
+        history = _History(self.sweeps, n, control)
+        made = fit_materials(
+            views,
+            problem.grid,
+            tv_weight=self.weight,
+            sweeps=self.sweeps,
+            seed=problem.seed,
+            go_on=history.heard,
+            stop=history.stopped,
+        )
+        settings: dict[str, Any] = {"materials": ",".join(self.materials), "sweeps": self.sweeps}
+        settings |= {"weights": made.weights}
+        if self.states and not history.stopped():
+            first, second = (self.materials.index(state) for state in self.states)
+            free = made
+            made = fit_share(views, free, (first, second), history.heard_share, history.stopped)
+            settings |= {"states": ",".join(self.states)} if made is not free else {}
+        series = VolumeSeries(np.empty(0), made.densities, made.residual, self.materials)
+        return history.result(series, made.grid, settings)
+
+    def toy(self) -> Self:
+        return replace(self, materials=("matter",), states=(), sweeps=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return material_costs(geometry, self.volumes, bool(self.states), self.sweeps)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        volumes = max(_VOLUMES * self.volumes, self.volumes + _OF_SHARE if self.states else 0)
+        return volumes * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+
+
+@dataclass
+class _History:
+    """Progress of a fit: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
+
+    sweeps: int
+    n_views: int
+    control: RunControl
+    of_sweeps: tuple[Progress, ...] = ()
+    tried: int = 0
+
+    def __post_init__(self) -> None:
+        self.began = self.control.now()
+
+    def stopped(self) -> bool:
+        """Somebody stops the fit."""
+        return self.control.should_stop is not None and self.control.should_stop()
+
+    def heard(self, sweep: int, residual: float) -> bool:
+        """As `fit_series` and `fit_materials` call their `go_on`."""
+        if sweep > 0:
+            self.tell(sweep, residual)
+        else:
+            self.tried += 1
+            self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
+            self.tried = 0 if sweep == 0 else self.tried
+        return not self.stopped()
+
+    def heard_share(self, steps_to_come: int) -> bool:
+        """As `fit_share` calls its `go_on`."""
+        self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
+        return not self.stopped()
+
+    def tell(self, sweep: int, residual: float) -> None:
+        """Of a sweep of the fit."""
+        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
+
+    def _tell(self, reached: Progress) -> Progress:
+        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
+        if self.control.on_progress is not None:
+            self.control.on_progress(now)
+        return now
+
+    def result(self, series: VolumeSeries, grid: Grid, settings: dict[str, Any]) -> Reconstruction:
+        """The volumes with this history."""
+        if not self.of_sweeps:  # it was stopped before
+            self.tell(0, series.residual)
+        return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series)
+
+
+def _progress(n: int, of: int, unit: str) -> Progress:
+    return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
+
+
+def _require_fit(sweeps: int, weight: float | None) -> None:
+    """ValueError for other settings than a fit takes."""
+    if isinstance(sweeps, bool) or not isinstance(sweeps, int) or sweeps < 1:
+        raise ValueError(f"sweeps must be a whole number, 1 or more, got {sweeps!r}")
+    if weight is not None and not (math.isfinite(weight) and weight >= 0):
+        raise ValueError(f"weight must be finite and 0 or more, got {weight!r}")
+
+
+def _require_own_grid(problem: ReconProblem) -> None:
+    if problem.grid != Grid.matching(problem.geometry):
+        raise ValueError("several volumes of the same views have the grid of these: leave out another one")
+
+
+def _bytes_of(geometry: Geometry) -> int:
+    """Of all line integrals."""
+    return 4 * geometry.n_views * math.prod(geometry.detector_shape)
+
+
+def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
+    """Line integrals [view, row, col], 0 and without weight where nothing was measured; and the weights."""
+    data, weights = problem.projections, problem.use.weights
+    if not (finite := np.isfinite(data)).all():
+        weights = finite.astype(np.float32) if weights is None else weights * finite
+    if weights is not None:
+        data = np.where(weights > 0, data, np.float32(0))
+    return data, weights
+
+
+def _because(still: float, moved: float, moves: bool) -> str:
+    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    if moves or moved >= still:
+        return f"{'motion' if moves else 'no motion'}, as {judged}"
+    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
