@@ -36,7 +36,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import Patches, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.pnp_dct import pnp_dct
@@ -118,7 +118,7 @@ class _Planning:
         weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
-        patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
+        patches, tried = _patches(problem, weight, lambda: judge), self.tried
         tried.direct = judge.residuals(judge.start) if judge.direct else None
         tried.smooth = judge.of_weight(weight)
         if patches.better:
@@ -161,6 +161,13 @@ class _Planning:
         taken = 0.0 if other is None else math.sqrt(np.mean(np.square(other, dtype=np.float64)))
         self.apart = taken > residuals.mean() and not is_coarse(seen.geometry, seen.grid)
         return None if trial.ended else residuals
+
+
+def _patches(problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None]) -> Patches:
+    """`choose_patches`; none where voxels are coarse, and without a search: they are never better there."""
+    if is_coarse(problem.projector.geometry, problem.projector.grid):
+        return Patches(0.0, False)
+    return choose_patches(problem, weight, trial)
 
 
 def _middle_of(volume: F32, shape: tuple[int, int, int]) -> F32:
@@ -231,9 +238,9 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
-    if watch.ended or "strength" not in decide.made:
-        return Candidates()
     tried = method.tried
+    if watch.ended or tried.smooth is None:
+        return Candidates()
     fits = tried.fit is not None and tried.by_voxels is not None and tried.fit.mean() < tried.by_voxels.mean()
     return replace(tried, prior={} if fits and method.apart else prior_decisions(decide.made))
 
@@ -253,7 +260,7 @@ class _Finish:
         trial = cache(partial(HeldOutTrial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
-            patches = choose_patches(problem, weight, trial)
+            patches = _patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
         if not isinstance(weight, NoiseBalance):
             weight *= self.share

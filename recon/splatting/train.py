@@ -351,13 +351,14 @@ def _steps(run: _Run) -> None:
             break
         fit.step(state, run.fitting, run.settings, length.fraction(state.step, spent))
         done += 1
-        if done == _TIMED and length.seconds is not None:
+        if done >= _TIMED and length.seconds is not None:
             spent = now() - begin
             remaining, step = length.seconds - spent, spent / done
-            if not length.planned:
+            if not length.planned and done == _TIMED:
                 length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
-            expected = state.step + (length.seconds - spent) / step
-            run.settings = in_steps(method.fit, min(expected, length.steps or expected))
+            if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
+                expected = state.step + max(0.0, length.seconds - spent) / step
+                run.settings = in_steps(method.fit, min(expected, length.steps or expected))
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             run.tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
