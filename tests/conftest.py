@@ -94,10 +94,18 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """A tenth of the time of collecting went into looking for garbage."""
+    if not getattr(session.config.option, "numprocesses", None):  # workers collect, not who leads them
+        gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """What is loaded now lives to the end: the garbage collector need not look through it time and again."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 # Not in processes that tests start, some of which run tests of another folder.

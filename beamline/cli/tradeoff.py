@@ -15,13 +15,13 @@ from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import (
     POSITIVE,
-    SEED,
     dry_option,
     json_option,
     names_in,
     others,
     parsed,
     refuse_contradictions,
+    seed_option,
     set_by,
     with_request,
 )
@@ -104,9 +104,7 @@ class TradeoffRequest:
         "would not fit is not begun.",
     )
     dry: bool = set_by(dry_option)
-    seed: int = set_by(
-        heading(METHOD), "--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."
-    )
+    seed: int = set_by(heading(METHOD), seed_option)
     output: Path | None = set_by(
         heading(OUTPUT),
         "-o",

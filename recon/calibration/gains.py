@@ -20,15 +20,15 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
-from recon.prep.rings import steadiness
+from recon.prep.rings import AT_AXIS, NARROWEST, steadiness
 from recon.voxels.held_out import beyond_chance, busiest_rows, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import iterative_memory
 
-LEAST_VIEWS, LEAST_COLS = 40, 64
-NEAR_AXIS = 4.0  # columns on either side: a body this small on the axis looks like gains
+LEAST_VIEWS, LEAST_COLS = 40, NARROWEST
+NEAR_AXIS = AT_AXIS
 
 _BAND, _HALO = 16, 4  # rows at a time; rows beside them that tell a stripe of all rows
 _ONE_IN = 6  # views held out

@@ -16,11 +16,11 @@ from scipy.ndimage import rotate
 
 from recon.base.arrays import F64
 from recon.prep.align import AxisError, axis_from_pair
+from recon.prep.axis_search import FEWEST_BANDS
 
 BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8
 ROUNDS = 3
-FEWEST_BANDS = 4
 FINEST = 0.05  # Columns: no band finds its axis better, since its rows mix with those beside it
 OUTLIER = 4.0  # Median distances from the line beyond which a band does not count
 

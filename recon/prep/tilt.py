@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 from recon.prep.align import opposite_curves
-from recon.prep.axis_search import FEWEST_COLS
+from recon.prep.axis_search import FEWEST_BANDS, FEWEST_COLS
 from recon.prep.axis_wedge import wedge_curves
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
 STEEPEST = math.radians(5)  # Largest tilt of the search, radians
-FEWEST_BANDS = 4
 _DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
 _FLOOR = 1e-3  # least mismatch that counts
 _NEWTON, _CLOSE = 20, 1e-4  # steps, and the change in px at which they end

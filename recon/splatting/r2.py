@@ -149,8 +149,7 @@ class R2:
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         preset = PRESETS[quality]
         count = max(1, round(preset.share * default_count))
-        slower = min(1.0, math.sqrt((self.planned_steps or DEFAULT_STEPS) / preset.steps))  # rates of a longer fit
-        return replace(self, steps=preset.steps, gaussians=count, fit=replace(self.fit, pace=slower * self.fit.pace))
+        return replace(self, steps=preset.steps, gaussians=count)
 
     def toy(self) -> Self:
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)

@@ -26,32 +26,12 @@ from recon.fields.methods import NAF
 from recon.prep.correct import Projections
 from recon.splatting.r2 import R2
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.clock import SteppedClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 40))
 SWEEP = 10.0  # s
-
-
-class At:
-    """A clock that shows one time."""
-
-    def __init__(self, time: float) -> None:
-        self.time = time
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds
-
-
-class Ticking(At):
-    """A clock that each look at it moves on by a tenth of a second."""
-
-    def now(self) -> float:
-        self.time += 0.1
-        return self.time
 
 
 def _prepared() -> PreparedProjections:
@@ -73,7 +53,7 @@ def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, f
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), Path("out.html") if report else None)
     method, before_report = fit_within(
-        R2(seconds=seconds), _prepared(), target, (100.0, 0.0), At(100.0 + spent), said.append
+        R2(seconds=seconds), _prepared(), target, (100.0, 0.0), SteppedClock(100.0 + spent), said.append
     )
     assert method.seconds is not None
     return method.seconds, 100.0 + seconds - before_report.deadline, said
@@ -100,7 +80,7 @@ def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> Non
 def test_a_method_without_a_start_is_told_of_none() -> None:
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), None)
-    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), At(109.0), said.append)
+    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), SteppedClock(109.0), said.append)
     assert len(said) == 1 and "nothing is left for the NAF method" in said[0] and "start" not in said[0]
 
 
@@ -113,7 +93,7 @@ def test_warnings_of_python_are_told_as_sentences() -> None:
 
 
 def _told(
-    folder: Path, method: R2, clock: At | SystemClock, stop: Callable[[], bool] = lambda: False
+    folder: Path, method: R2, clock: SteppedClock | SystemClock, stop: Callable[[], bool] = lambda: False
 ) -> tuple[list[Event], list[str]]:
     """Events of a reconstruction, and its phases."""
     events: list[Event] = []
@@ -133,7 +113,7 @@ def _told(
 
 
 def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_it_can(tmp_path: Path) -> None:
-    events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), Ticking(0.0))
+    events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), SteppedClock(tick=0.1))
     said = [str(event.data.get("message", "")) for event in events]
     fit = next(n for n, event in enumerate(events) if event.data.get("stage") == "recon")
     assert any("2 s do not suffice" in text for text in said[:fit])
