@@ -111,7 +111,7 @@ def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: P
     np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
     assert not kept.ended_early
     with pytest.raises(api.DataError, match="12 views or more for each"):
-        api.reconstruct(scan, recon.TimeSeries(volumes=4), selection=wanted, say=None)
+        api.reconstruct(scan, replace(method, volumes=4), selection=wanted, say=None)
     for output, more in (("other.tif", {}), ("other.h5", {"rows": (0, 1), "views": "fixed:12"})):
         with pytest.raises((api.ConfigError, api.DataError)):
             api.reconstruct(scan, method, output=tmp_path / output, say=None, **more)
@@ -171,7 +171,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     costs = Costs({"rest": Work.of(CLOCK, 30.0), "moving": Work.of(CLOCK, 70.0)})
-    monkeypatch.setattr("recon.series.series_costs", lambda *_: costs)
+    monkeypatch.setattr("recon.joint_methods.series_costs", lambda *_: costs)
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
