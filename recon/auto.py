@@ -11,16 +11,14 @@ import numpy as np
 from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.method import ChoosingMethod, Method, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod, Costs, Work
 from recon.splatting.finish import Candidates
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
-from recon.trials import ROWS, of_views, part_of, predicts_best
+from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import Fbp
 from recon.voxels.held_out import TRIAL_ROWS
 from recon.voxels.methods.fista_tv import FistaTv
@@ -39,7 +37,7 @@ class Auto:
     The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
     and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
     settings of their own, each is run on 32 rows, or on all of them at half the resolution. There is no trial with
-    fewer than 16 views, or of a sample wider than the field: the last one takes these. docs/choosing.md has reasons.
+    fewer than 16 views: the last one takes these. docs/choosing.md has reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
@@ -75,11 +73,6 @@ class Auto:
         Methods that views held out judge in one trial, as `r2` does, are not run for it. `decide` takes its prior.
         """
         last = len(self.candidates) - 1
-        wider = [n for n, method in enumerate(self.candidates) if method.traits.any_grid]
-        if wider and is_wider(problem):
-            name = self.candidates[wider[0]].name
-            why = "views do not fall to zero at their edges, as of a sample wider than the field"
-            return wider[0], f"{why}, and only {name} models what is beyond it", False
         fit = self._fit
         if fit is not None:
             listen = control.on_progress if control.decide is None else None  # in a slab only slices are counted
@@ -110,7 +103,7 @@ class Auto:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """Of the trial that judges all candidates, or of one of each; a sample wider than the field has none."""
+        """Of the trial that judges all candidates, or of one of each."""
         methods = [
             method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
         ]
@@ -127,12 +120,6 @@ class Auto:
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)
-
-
-def is_wider(problem: ReconProblem) -> bool:
-    """Whether some views show that the sample leaves the field; only methods with the trait `any_grid` model this."""
-    some = of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
-    return leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry)
 
 
 def _judged_beside(method: Method) -> bool:

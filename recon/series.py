@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
@@ -22,7 +23,7 @@ from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import JUDGED, JUDGED_SWEEPS, SWEEPS_OF_TURN, OfMoments, learnt_motion, levels, unseen_squares
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import weight_of, weights_by_views
-from recon.voxels.held_out import ONE_IN, beyond_chance, busiest_rows, slab_of
+from recon.voxels.held_out import beyond_chance, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 

@@ -13,11 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyViews
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import Materials
-from recon.voxels.held_out import ONE_IN, busiest_rows, slab_of
+from recon.voxels.held_out import busiest_rows, slab_of
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 _ROWS, _DEEPEST = 16, 7.0  # of trials; line integral from which on rays weigh alike

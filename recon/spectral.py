@@ -14,13 +14,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS
-from recon.voxels.held_out import ONE_IN, busiest_rows, slab_of
+from recon.voxels.held_out import busiest_rows, slab_of
 
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray

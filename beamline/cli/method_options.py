@@ -15,7 +15,8 @@ from beamline.cli.options import POSITIVE, declared, option, parsed, rules_of, r
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
-from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, MODEL_STEPS, Loss, Start
+from recon.base.choices import AUTO, KERNEL, Loss, Start
+from recon.base.empirical import DEFAULT_STEPS, MODEL_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
 from recon.methods import DEFAULT, build, by_name, has_setting, names, taking

@@ -89,7 +89,7 @@ def monitor(request: MonitorRequest) -> None:
         if again := summed.retaken:
             end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
-        back = [f"On the way back: {view.said()}." for view in returned]
+        back = [f"On the way back: {view.in_words()}." for view in returned]
         drift = [summed.drift] if summed.drift else []
         lines = [*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *watched.ended, end]
         click.echo("\n".join(lines))

@@ -187,10 +187,10 @@ class _Output:
 def _explain(scan: Scan, output: _Output) -> None:
     from beamline.simulate.scene_file import cost_table, frame_cost
 
-    found, where = frame_cost(scan, time.perf_counter), machine()
-    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
-    output.event(CostExplained(asdict(found) | {"costs": costs, "machine": where}))
-    output.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
+    cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
+    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]
+    output.event(CostExplained(asdict(cost_of_frame) | {"costs": costs, "machine": where}))
+    output.lines(f"{machine_line(where)}\n\n{cost_table(cost_of_frame)}")
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict[str, object]:

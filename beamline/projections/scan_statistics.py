@@ -169,7 +169,7 @@ class Light:
         """What so many frames cost, by name."""
         return {"photons": self.photons * frames} | ({} if self.gray is None else {"gray": self.gray * frames})
 
-    def said(self) -> list[str]:
+    def in_words(self) -> list[str]:
         """Sentences on all views."""
         each = f"{self.photons:.4g} photons a pixel and view in the open beam"
         out = [f"{each}, {self.photons * self.views:.4g} in {self.views} views"]

@@ -17,13 +17,13 @@ from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
 from recon.assess.plans import Choice, Speeds, plans
 from recon.assess.time_model import duration_text
-from recon.auto import is_wider
 from recon.base.binning import bin_views
+from recon.base.masks import masked
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
 from recon.base.work import Rates
 from recon.methods import with_settings
-from recon.splatting.initialise import default_count
+from recon.splatting.initialise import default_count, leaves_the_field
 from recon.splatting.work import speeds_of
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
@@ -147,7 +147,7 @@ def within(
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
     modelled = {name: method for name, method in taking.items() if method.traits.any_grid or method.traits.direct}
-    if any(method.traits.any_grid for method in modelled.values()) and is_wider(_problem_of(prepared, seed)):
+    if any(method.traits.any_grid for method in modelled.values()) and _is_wider(prepared):
         taking = modelled
     plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
     choices = plan.choices()
@@ -165,6 +165,15 @@ def within(
     end = begin + budget * (1 - _RESERVE)
     result = _run(method, prepared, seed, end, control)
     return Budgeted(result, prepared, choice, speeds, because, now() - begin)
+
+
+def _is_wider(prepared: PreparedProjections) -> bool:
+    """Some views show that the sample leaves the field; only methods with the trait `any_grid` model this."""
+    some = slice(None, None, max(1, prepared.geometry.n_views // 32))
+    problem = _problem_of(prepared, 0)
+    weights = problem.use.weights
+    views = masked(problem.projections[some], None if weights is None else weights[some])[0]
+    return leaves_the_field(views, problem.geometry.select(np.arange(prepared.geometry.n_views)[some]))
 
 
 def _chosen(
@@ -190,7 +199,7 @@ def _chosen(
     else:
         return by_curves, f"{expected}the scan has too few rows for a trial in this time"
     count = default_count(part.geometry, part.geometry.sample_pitch)
-    trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
+    trial = RunControl(control.stop, now=control.now).by(control.now() + _TRIAL_SLACK * seconds)
     liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
     order = [liked.index(c) for c in tried]
     at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
@@ -213,14 +222,9 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     if method.traits.held_out:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
-    trials = _until(control, now() + _OF_TRIALS * (end - now()))
-    control = replace(control, should_stop=_until(control, end), stop_trials=trials)
+    trials = control.stop.by(now() + _OF_TRIALS * (end - now()), now)
+    control = replace(control.by(end), stop_trials=trials)
     return recon.reconstruct(data, geometry, method, grid=grid, seed=seed, use=use, control=control)
-
-
-def _until(control: RunControl, end: float) -> Callable[[], bool]:
-    """Stops with `control`, or when its clock shows `end`."""
-    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
 def _named(choice: Choice, result: Reconstruction | None = None) -> str:

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from enum import Enum, auto
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.jumps import Jumps
@@ -44,6 +42,7 @@ from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
@@ -340,7 +339,7 @@ class ScanFollower:
         self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
 
         begin = last = self._clock.now()
-        stop_latch, wanted = StopLatch(should_stop), self._options.streaming.finish_sweeps
+        stop, wanted = Stop(should_stop), self._options.streaming.finish_sweeps
         plan = FinishPlan(0, 0.0)
         if wanted:
             grid = Grid.matching(prepared.geometry)
@@ -352,7 +351,7 @@ class ScanFollower:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return stop_latch()
+            return stop()
 
         try:
             self._say(self._fit.finish(max(begin + seconds - plan.seconds - self._clock.now(), 0.0), on_progress))
@@ -360,12 +359,12 @@ class ScanFollower:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians
         sweeps = wanted if plan.sweeps is None else min(wanted, plan.sweeps)
-        if sweeps and gaussians is not None and not stop_latch():
+        if sweeps and gaussians is not None and not stop():
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())
             problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
             say = progress_events(self._sink, self._clock)
-            late = partial(self._late, stop_latch, begin + seconds)
+            late = stop.by(begin + seconds, self._clock.now)
             trials = None if plan.trials else lambda: True
             control = RunControl(late, say, now=self._clock.now, stop_trials=trials)
             volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, control)
@@ -374,15 +373,11 @@ class ScanFollower:
             "finish": sweeps,
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if stop_latch.stopped else {}),
+            **({"ended_early": True} if stop.stopped else {}),
         }
         method, elapsed = self._options.method.name, self._clock.now() - self._begin
         history = tuple(self._history)
         return Reconstruction(volume, settings, history, gaussians, method=method, seconds=elapsed), prepared
-
-    def _late(self, stop_latch: StopLatch, end: float) -> bool:
-        """Asked to stop, or beyond the time of the finish."""
-        return stop_latch() or self._clock.now() >= end
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
@@ -409,11 +404,11 @@ class ScanFollower:
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
-                if done[step.name].said:
+                if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
                     self._fit.replace_views(projections.data)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""
-        corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)
+        corrections_done({name: each.sentence for name, each in done.items()}, self._sink, self._clock)

@@ -315,10 +315,10 @@ def pose_curves(
     shown = [curve for curve in curves if curve[0].any()]
     figure = Figure(figsize=(WIDTH, 2.4 * len(shown)), dpi=DPI, layout="constrained")
     order = np.argsort(angles_deg, kind="stable")
-    for axes, (values, said, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
+    for axes, (values, label, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
         for column, name in enumerate(names):
             axes.plot(angles_deg[order], values[order, column], lw=1.0, marker=".", ms=2, label=name)
-        axes.set(xlabel="angle (degrees)", ylabel=said)
+        axes.set(xlabel="angle (degrees)", ylabel=label)
         axes.legend(fontsize=8)
         axes.grid(alpha=0.3)
     return png(figure)

@@ -38,10 +38,10 @@ class XafsResult:
     @property
     def tabulated(self) -> str:
         """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
-        from beamline.xafs.tabulated import said_of  # lazily: it imports xraylib, which takes a while
+        from beamline.xafs.tabulated import edge_sentence  # lazily: it imports xraylib, which takes a while
 
         low, high = (float(end) for end in self.curve.energies[[0, -1]])
-        return said_of(self.material, self.elements, low, high, self.edge.energy)
+        return edge_sentence(self.material, self.elements, low, high, self.edge.energy)
 
     @property
     def criterion(self) -> str:

@@ -18,10 +18,6 @@ Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 
-DEFAULT_STEPS = 400  # Steps of a fit before a finish on voxels
-
-MODEL_STEPS = 50  # Steps of a fit whose volume voxels make, as they predict as well: its Gaussians are a rough model
-
 NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
 
 N_GAUSSIANS, SIDE = 50_000, 256  # Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view

@@ -16,10 +16,8 @@ from recon.base.geometry import Geometry
 _VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
-_CLEARLY = 1.15  # structure is taken for noise, where the noise beside it is less by so much
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
-_SHORTER_SIDE = 0.4  # of the columns, at least, from the axis to the nearer edge: fewer resolve no bow-tie
-_EVEN, _MARGIN = 0.02, 1.1  # of a step between views; of the bound
+_EVEN = 0.02  # of a step between views
 _BLOCKS, _BLOCK = 8, 5
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
 _SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40  # standard deviations; columns with one on the other side of the axis
@@ -69,24 +67,22 @@ def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
     Args:
         lines: [view, col, row]; rows with NaN are not used.
     """
-    found, few = noise_level(lines), _beyond_the_bow_tie(lines, geometry)
-    return few if few * _CLEARLY < found else found
+    return min(noise_level(lines), _beyond_the_bow_tie(lines, geometry))
 
 
 def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     """Standard deviation of white noise with the same power there; infinite where it cannot be told."""
     order = _evenly_spread(geometry)
-    cols = geometry.detector_shape[1]
+    cols, bins = geometry.detector_shape[1], np.arange(2, 2 + _BOW_TIE_BINS)
     axis = geometry.axis_col + geometry.shifts[:, 0]
     half = int(min(axis.min(), cols - 1 - axis.max()))
     rows = np.flatnonzero(np.isfinite(lines).all(axis=(0, 1)))
-    if order is None or not geometry.is_straight or geometry.skew or half < _SHORTER_SIDE * cols or not rows.size:
+    if order is None or not geometry.is_straight or geometry.skew or half <= bins[-1] or not rows.size:
         return math.inf
     rows = rows[:: -(-rows.size // _BOW_TIE_ROWS)]
     middle = round(float(axis.mean()))
     at = np.arange(max(0, middle - half), min(cols, middle + half + 1))
     window = np.hanning(at.size + 2)[1:-1]
-    bins = np.arange(2, 2 + _BOW_TIE_BINS)
     omega = 2 * np.pi * bins / at.size
     waves = window[:, None] * np.exp(-1j * omega * (at[:, None] - middle))
     spectrum = np.einsum("vcr,cm->vmr", lines[order][:, at][:, :, rows], waves, optimize=True)
@@ -98,7 +94,7 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
     reach = half + 0.5 + float(np.ptp(axis))
     off = reach * geometry.sample_pitch / geometry.sod
-    bound = _MARGIN * reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
+    bound = reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
     free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
     few = power[free]
     return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf

@@ -133,10 +133,14 @@ def surface(
         count(min(last + 1, n), n)
     if not vertices:
         raise ValueError(f"no surface: no value lies above the level {level:.4g}")
-    place = np.concatenate(vertices)
-    place *= np.asarray(grid.spacing[::-1], np.float32)
-    place += np.asarray(grid.first[::-1], np.float32)
-    return Mesh(place, np.concatenate(faces))
+    return Mesh(_in_mm(np.concatenate(vertices), grid), np.concatenate(faces))
+
+
+def _in_mm(vertices: F32, grid: Grid) -> F32:
+    """Vertices (x, y, z) in voxels from the first one, changed to mm in place."""
+    vertices *= np.asarray(grid.spacing[::-1], np.float32)
+    vertices += np.asarray(grid.first[::-1], np.float32)
+    return vertices
 
 
 def _least(data: BySlices, n: int, thick: int, level: float) -> float:

@@ -12,6 +12,7 @@ Search = tuple[float, float] | None
 
 MOST_ROWS = 16  # Rows that are enough for 0.1 px
 FEWEST_COLS = 8  # Columns that an axis can be found from
+FEWEST_BANDS = 4  # Bands of rows that show how it leans
 AGREE = 1.0  # Two independent estimates no farther apart than this (px) are the same axis
 
 

@@ -16,11 +16,11 @@ from scipy.ndimage import rotate
 
 from recon.base.arrays import F64
 from recon.prep.align import AxisError, axis_from_pair
+from recon.prep.axis_search import FEWEST_BANDS
 
 BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8
 ROUNDS = 3
-FEWEST_BANDS = 4
 FINEST = 0.05  # Columns: no band finds its axis better, since its rows mix with those beside it
 OUTLIER = 4.0  # Median distances from the line beyond which a band does not count
 
@@ -89,12 +89,12 @@ def _slope(a: F64, b: F64, axis_col: float) -> tuple[float, float]:
     near = max(8.0, 0.05 * a.shape[1])
     for rows in np.array_split(np.arange(len(a)), max(n, 1)):
         try:
-            found = axis_from_pair(a[rows], b[rows], (axis_col - near, axis_col + near))
+            estimate = axis_from_pair(a[rows], b[rows], (axis_col - near, axis_col + near))
         except AxisError:
             continue
-        if found.confident:
+        if estimate.confident:
             heights.append(float(rows.mean()) - (len(a) - 1) / 2)
-            columns.append(found.value)
+            columns.append(estimate.value)
     h, c = np.array(heights), np.array(columns)
     for _ in range(2):
         if h.size < FEWEST_BANDS:

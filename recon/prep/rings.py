@@ -23,13 +23,13 @@ from recon.base.units import warn_of_other_quantity
 
 _ROBUST = 1.4826  # as 1 / MEDIAN, rounded: volumes that were recorded have it in what `by_sorting` takes off
 _FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
-_FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
+_FEWEST_VIEWS, NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
 _MOST = 0.1  # of the columns
 _EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
 _SEEN = 3.5  # `Steadiness.score` from which on there are stripes: 0.3 to 2.7 without, 4.4 and 5.3 in two real scans
 _ONE_SIDED = 0.5  # of pixels' answers the odd part equals the even one; layers of the sample have hardly any
 _BLOCKS, _BLOCK = 8, 8  # contiguous blocks of views, and views of the smallest one
-_AT_AXIS = 4.0  # columns on either side: a body this small on the axis stays in them
+AT_AXIS = 4.0  # Columns on either side: a body this small on the axis looks like a ring
 _FEWEST_PAIRS = 20  # mirrored columns
 _ROWS = 8  # looked at
 _COPIES = 13  # float32 copies of a sinogram
@@ -173,7 +173,7 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
     """
     n, rows, cols = sinograms.shape
     blocks = np.array_split(np.arange(n), min(max(n // _BLOCK, 2), _BLOCKS))
-    right = np.arange(math.ceil(axis_col + _AT_AXIS), cols)
+    right = np.arange(math.ceil(axis_col + AT_AXIS), cols)
     right = right[2 * axis_col - right >= 0]
     if right.size < _FEWEST_PAIRS:
         return None
@@ -214,12 +214,12 @@ class WithoutRings:
     Attributes:
         data: float32 [view, row, col], line integrals.
         taken: float32 [row, col], mean removed part of a view.
-        said: a sentence about the removal.
+        sentence: a sentence about the removal.
     """
 
     data: F32
     taken: F32
-    said: str
+    sentence: str
 
 
 def remove_rings(
@@ -270,10 +270,10 @@ def remove_rings_in_place(
     taken = np.zeros(views.shape[1:], np.float32)
     if rings == "none":
         return taken, ""
-    if len(views) < _FEWEST_VIEWS or views.shape[2] < _NARROWEST:
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return taken, (
             f"Rings: {len(views)} views of {views.shape[2]} columns are too few to tell stripes from the sample (at "
-            f"least {_FEWEST_VIEWS} of {_NARROWEST}); none removed."
+            f"least {_FEWEST_VIEWS} of {NARROWEST}); none removed."
         )
     order = np.argsort(angles, kind="stable")
     axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
@@ -297,7 +297,7 @@ def remove_rings_in_place(
 
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     """A sentence where pixels answer so unequally that rings are seen, with what removes them; otherwise ""."""
-    if len(views) < _FEWEST_VIEWS or views.shape[2] < _NARROWEST:
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return ""
     steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
     if steady is None or not steady.stripes:
@@ -329,7 +329,7 @@ def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
     rows, cols = shape
     looked_at = views * min(rows, _ROWS) * cols
-    if rings == "none" or views < _FEWEST_VIEWS or cols < _NARROWEST:
+    if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:
         return 4 * (rows * cols + looked_at)
     padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
     return 4 * (rows * cols + looked_at + _COPIES * (padded if rings == "wavelet" else views * cols))
@@ -349,7 +349,7 @@ def _far_off(sinogram: F32, axis_col: float) -> bool:
     across = np.rint(2 * axis_col - columns).astype(int)
     seen = (across >= 0) & (across < strong.size)
     mirrored = seen & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
-    own = strong & ~mirrored & (np.abs(columns - axis_col) > _AT_AXIS)
+    own = strong & ~mirrored & (np.abs(columns - axis_col) > AT_AXIS)
     return bool(own.any() and changed <= strong.size / 5)
 
 

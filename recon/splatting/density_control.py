@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -9,13 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-
-# Each half of a split moves this far from the centre, in standard deviations along the longest axis.
-_APART = 0.75
-
-# Standard deviations (of the longest axis) outside the box beyond which a Gaussian is removed. The tail of a nearer one
-# is part of the views: without it, matter at the border is lost (0.05 to 0.16 dB, measured).
-_LOST = 3.0
+from recon.base.empirical import APART, GROWTH, LOST
+from recon.base.settings_check import check_settings
 
 _PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 
@@ -26,34 +22,33 @@ Rule = Literal["mass", "published"]
 class DensityPolicy:
     """When density control runs, and its thresholds.
 
-    `every`, `stop` and `threshold` are those of Zha et al. 2024, the others are for short fits. `published` has all
-    published settings.
+    All but `growth` and `rule` are those of Zha et al. 2024.
 
     Attributes:
         start, stop: first and last step as fractions of all steps.
         every: steps between two rounds.
         threshold: mean gradient of the loss with respect to a centre, per half detector width, above which a Gaussian
             is split or cloned.
-        large: a Gaussian longer than this fraction of the field is split; a smaller one is cloned.
+        large: a Gaussian longer than this fraction of the field is split; a smaller one is cloned. By the rule "mass"
+            all are split.
         prune_below: density (in density units) below which a Gaussian is removed.
         growth: largest number of Gaussians, relative to the number at the start.
-        rule: "mass": clones and splits conserve the mass of the Gaussian, see `control`. "published": a clone is two
-            equal Gaussians of half the density. A split draws two centres from the Gaussian, with half its density and
-            its width over 1.6. A Gaussian is removed where its centre leaves the box.
+        rule: "mass": splits conserve the mass of the Gaussian, see `control`. "published": a clone is two equal
+            Gaussians of half the density. A split draws two centres from the Gaussian, with half its density and its
+            width over 1.6. A Gaussian is removed where its centre leaves the box.
     """
 
-    start: float = 0.05
+    start: float = 500 / 30_000
     stop: float = 0.5
     every: int = 100
     threshold: float = 5e-5
-    large: float = 0.01
-    prune_below: float = 1e-4
-    growth: float = 1.5
+    large: float = 0.1
+    prune_below: float = 1e-5
+    growth: float = GROWTH
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
-        if self.rule not in get_args(Rule):
-            raise ValueError(f"rule must be one of {', '.join(get_args(Rule))}, got {self.rule!r}")
+        check_settings(self, choices={"rule": get_args(Rule)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +77,7 @@ def control(
     box: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Change:
-    """Compute one round. By the rule "mass" every clone and split conserves ρ √|Σ|: the projections hardly change.
+    """Compute one round. By the rule "mass" every split conserves ρ √|Σ|: the projections hardly change.
 
     Pruning comes first: a model at its limit may add as many Gaussians as were pruned. The number then stays constant,
     and faint or outside Gaussians are in effect relocated to places where the statistic is largest.
@@ -95,11 +90,11 @@ def control(
         limit: largest number of Gaussians.
         box: [2, 3] mm, lower and upper corner (x, y, z); a Gaussian whose centre is more than three standard deviations
             of its longest axis outside is removed.
-        rng: draws the direction in which a clone or half moves.
+        rng: draws the centres of halves by the rule "published".
     """
     means, log_scales, rotations, raw = model
     density = np.logaddexp(0, raw)
-    lost = _LOST if policy.rule == "mass" else 0.0
+    lost = LOST if policy.rule == "mass" else 0.0
     reach = lost * np.exp(log_scales.max(axis=1, keepdims=True))
     alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
     wanted = np.flatnonzero(alive & (statistic > policy.threshold))
@@ -108,9 +103,12 @@ def control(
         wanted = wanted[np.argsort(-statistic[wanted], kind="stable")[:free]]
         wanted.sort()
 
-    split = np.exp(log_scales[wanted].max(axis=1)) > policy.large * field
-    halves = _halves if policy.rule == "mass" else _published_halves
-    first, second, narrower, divisor = halves(log_scales[wanted], rotations.reshape(-1, 3, 3)[wanted], split, rng)
+    widths, turned = log_scales[wanted], rotations.reshape(-1, 3, 3)[wanted]
+    if policy.rule == "mass":
+        first, second, narrower, divisor = _halves(widths, turned)
+    else:
+        split = np.exp(widths.max(axis=1)) > policy.large * field
+        first, second, narrower, divisor = _published_halves(widths, turned, split, rng)
     new_means, new_scales, new_raw = means.copy(), log_scales.copy(), raw.copy()
     new_means[wanted] += first
     new_scales[wanted] += narrower
@@ -125,36 +123,31 @@ def control(
     )
 
 
-def _halves(
-    log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[F32, F32, F32, NDArray[np.float64]]:
-    """Splits and clones Gaussians by the rule "mass".
+def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
+    """Splits Gaussians by the rule "mass".
 
-    Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
-    Cloning: two of half the density, a small distance apart, since equal ones would always get equal gradients.
+    Two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
 
     Returns:
         Shifts of the first and second halves [n, 3] mm, what is added to their log scales [n, 3], and what their
-        density is divided by [n].
+        density is divided by.
     """
-    at, axis = np.arange(split.size), log_scales.argmax(axis=1)
-    sign = np.where(rng.random(split.size) < 0.5, 1, -1)
-    apart = np.where(split, _APART, 0.25) * np.exp(log_scales[at, axis]) * sign
-    shrink = np.where(split, np.sqrt(1 - _APART**2), 1.0)
+    at, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
+    apart, shrink = APART * np.exp(log_scales[at, axis]), math.sqrt(1 - APART**2)
     offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
-    narrower[at, axis] = np.log(shrink)
+    narrower[at, axis] = math.log(shrink)
     return offset, -offset, narrower, 2 * shrink
 
 
 def _published_halves(
     log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[F32, F32, F32, NDArray[np.float64]]:
+) -> tuple[F32, F32, F32, float]:
     """The same by the rule "published": mass and covariance are not conserved."""
     own = np.exp(log_scales) * rng.standard_normal((2, *log_scales.shape))
     first, second = np.einsum("nij,hnj->hni", rotations, own * split[:, None]).astype(np.float32)
     narrower = np.where(split, -np.log(_PUBLISHED_SHRINK), 0.0)[:, None].astype(np.float32)
-    return first, second, np.broadcast_to(narrower, log_scales.shape), np.full(split.size, 2.0)
+    return first, second, np.broadcast_to(narrower, log_scales.shape), 2.0
 
 
 def _inverse(density: NDArray[np.floating]) -> F32:

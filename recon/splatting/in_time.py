@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
-from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
+from recon.splatting.finish import SUBSETS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
+from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps, is_coarse
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
@@ -92,7 +93,7 @@ class FinishPlan(NamedTuple):
 
 
 def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
-    """A fit's finish within `seconds`: at most `SWEEPS`, unless `beside_steps` suffice for patches and their trials.
+    """A fit's finish within `seconds`: the usual sweeps at most, unless `beside_steps` suffice for patches and trials.
 
     Where time is short it goes without trials of its weight, which on few rows cost more than seven finishes. A time
     for fewer than two sweeps gives 0, because the work before them takes as long.
@@ -102,12 +103,15 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
-    most = before + (SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+    if is_coarse(geometry, grid):
+        most = before + FINISH_SWEEPS * sweep + choice
+    else:
+        most = before + (FINISH_SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
     if choice and most <= min(seconds, beside_steps):
         return FinishPlan(None, most)
-    trials = before + choice + SWEEPS * sweep <= seconds
+    trials = before + choice + FINISH_SWEEPS * sweep <= seconds
     before += choice if trials else 0.0
     if not before + 2 * sweep <= seconds:
         return FinishPlan(0, 0.0)
-    sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
+    sweeps = min(FINISH_SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else FINISH_SWEEPS
     return FinishPlan(sweeps, before + sweeps * sweep, trials)

@@ -13,6 +13,19 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from recon.base.binning import bin_views
 from recon.base.choices import Filter
 from recon.base.choices import Start as Start
+from recon.base.empirical import (
+    AT_THE_EDGE,
+    EMPTY,
+    LEAST_GAUSSIANS,
+    MOST_GAUSSIANS,
+    SMOOTHED,
+    SPREAD,
+    START_SWEEPS,
+    START_WEIGHT,
+    VOXELS_A_GAUSSIAN,
+    WILD_PIXEL,
+    WILD_VIEWS,
+)
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.masks import masked
@@ -32,28 +45,12 @@ from recon.voxels.view_weights import angular_weights
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
 
-# Standard deviation of a new Gaussian over the distance to its neighbours. Zha et al. take 1; narrower ones are sharper
-# and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3). With a finish on voxels
-# 0.6 is as good as 0.8 in a tenth less time, since a Gaussian covers fewer pixels.
-_SPREAD = 0.6
-
 # The published start: density of a Gaussian over that of its voxel, and its least width over the field's.
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
-# A pixel counts as wild above this many times the largest pixel of other views, a ratio that no sample reaches. Up to a
-# tenth of the views, and at least one, may contain such pixels.
-_WILD, _WILD_VIEWS = 10.0, 0.1
-
-# Edges at this share of the largest distance from the axis, or farther, count. Below this share of a mean value they
-# are empty: the air of a measured walnut has 0.07.
-_FARTHEST, _EMPTY = 0.95, 0.15
-
 SCALED_BY = 12  # views
-_COUNTS = 2000, 200_000  # Gaussians
 _LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
-_SWEEP_WEIGHT = 0.004  # density units
-_SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ def count_for(field: Grid, cone: bool) -> int:
     Of a cone, whose field is often much larger than the sample, at most V^(2/3) for V voxels: Gaussians gather at
     surfaces (docs/published.md).
     """
-    return int(np.clip(_count_of(field, cone), *_COUNTS))
+    return int(np.clip(_count_of(field, cone), LEAST_GAUSSIANS, MOST_GAUSSIANS))
 
 
 def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
@@ -104,7 +101,7 @@ def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int])
 
 def _count_of(field: Grid, cone: bool) -> float:
     voxels = math.prod(field.shape)
-    count = np.pi / 4 * voxels / 60
+    count = np.pi / 4 * voxels / VOXELS_A_GAUSSIAN
     return min(count, voxels ** (2 / 3)) if cone else count
 
 
@@ -157,7 +154,7 @@ def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bo
     width = max(2, cols // 50)
     edges = np.stack((projections[..., :width].mean(axis=(1, 2)), projections[..., -width:].mean(axis=(1, 2))), 1)
     inside = float(np.median(projections.mean(axis=(1, 2))))
-    return bool(np.median(edges[away > _FARTHEST * away.max()]) > _EMPTY * inside)
+    return bool(np.median(edges[away > AT_THE_EDGE * away.max()]) > EMPTY * inside)
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -167,8 +164,8 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
     views, and at least one, may contain such pixels. A view with no other pixels is clipped.
     """
     peaks = np.maximum(projections.max(axis=(1, 2)), -projections.min(axis=(1, 2)))
-    sound = max(1, peaks.size - max(1, round(_WILD_VIEWS * peaks.size)))
-    largest = _WILD * float(np.partition(peaks, sound - 1)[sound - 1])
+    sound = max(1, peaks.size - max(1, round(WILD_VIEWS * peaks.size)))
+    largest = WILD_PIXEL * float(np.partition(peaks, sound - 1)[sound - 1])
     if not (0 < largest < peaks.max()):
         return projections
     cleaned = np.array(projections, np.float32)
@@ -214,12 +211,12 @@ def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid
 
 def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
     """The sweeps that make the first volume; None: FBP or FDK does."""
-    return OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True) if _swept(geometry, start) else None
+    return OsSirtTv(iterations=START_SWEEPS, tv_weight=START_WEIGHT, momentum=True) if _swept(geometry, start) else None
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:
     """About how many sweeps of FISTA-TV over all views take as long as the first volume."""
-    return 2 * _SWEEPS if _swept(geometry, start) else 1.0
+    return 2 * START_SWEEPS if _swept(geometry, start) else 1.0
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:
@@ -232,7 +229,7 @@ def sample_gaussians(
     rng: np.random.Generator,
     *,
     field_radius: float,
-    smooth: float = 1.0,
+    smooth: float = SMOOTHED,
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Gaussians:
     """At most n isotropic Gaussians drawn from a volume.
@@ -263,7 +260,7 @@ def sample_gaussians(
     k, j, i = np.unravel_index(chosen, data.shape)
     jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.spacing[::-1]
     means = np.stack((x[i], y[j], z[k]), 1) + jitter
-    scales = _SPREAD * neighbour_distance(means)
+    scales = SPREAD * neighbour_distance(means)
     scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
     densities = data.ravel()[chosen].astype(np.float64) * unit
     return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, gaussian_filter1d
 
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.iterative import Watch, solve
@@ -33,7 +34,6 @@ TRIAL = 0.25  # pixels by which the sample is moved for derivatives
 FARTHEST = 4.0  # most pixels of a step
 RELAXED = 1.5  # factor on a step: the corrected views are in the volume, too, and make steps too small
 _STEPS = 4  # steps of the first registration
-_HELD_OUT = 8  # one of so many views judges
 _MEASURED = 0.99  # of the weight that interpolation gives a pixel: less, and a neighbour was not measured
 
 
@@ -171,7 +171,7 @@ def judge(
     """
     problem = _Problem(projections, geometry, parts, known)
     views = np.arange(geometry.n_views)
-    held = views[_HELD_OUT // 2 :: _HELD_OUT]
+    held = views[ONE_IN // 2 :: ONE_IN]
     used = np.setdiff1d(views, held)
     whole = problem.volume(moves, used)
     alone = problem.volume(moves, used[parts[used] == problem.longest])

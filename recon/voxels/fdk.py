@@ -94,22 +94,8 @@ def fdk(
         ValueError: for a parallel beam, rolled or tilted views, too short a scan, an unknown filter. Also for a shape
             that does not belong to the geometry, values that are not finite, or a box that reaches the source.
     """
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if projections.shape != expected:
-        raise ValueError(
-            f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
-        )
-    if not geometry.is_cone:
-        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
-    if not geometry.is_straight:
-        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
     grid = Grid.matching(geometry) if grid is None else grid
-    refuse_climbing(geometry)
-    reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
-    if reach >= geometry.sod:
-        raise ValueError(
-            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
-        )
+    _refuse(projections.shape, geometry, grid)
     weights, (before, after) = cone_weights(geometry)
     z, y, x = grid.coordinates()
     rows, cols = geometry.detector_shape
@@ -129,6 +115,23 @@ def fdk(
             )  # fmt: skip
             on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
     return volume_slices(volume)
+
+
+def _refuse(shape: tuple[int, ...], geometry: Geometry, grid: Grid) -> None:
+    """ValueError for views or a box that FDK does not take."""
+    expected = (geometry.n_views, *geometry.detector_shape)
+    if shape != expected:
+        raise ValueError(f"projections have shape {shape}, the geometry expects [view, row, col] {expected}")
+    if not geometry.is_cone:
+        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
+    if not geometry.is_straight:
+        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
+    refuse_climbing(geometry)
+    reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
+    if reach >= geometry.sod:
+        raise ValueError(
+            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
+        )
 
 
 def refuse_climbing(geometry: Geometry) -> None:

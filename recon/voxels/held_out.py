@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.decisions import Decisions
+from recon.base.empirical import AIR, ALIKE, BESIDE_MATTER, COARSE, ENOUGH_MATTER, OF_MATTER, ONE_IN, TRIAL_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
@@ -26,25 +27,18 @@ from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
 
-ONE_IN = 8  # views held out
 LEAST_VIEWS = 2 * ONE_IN
 
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-TRIAL_SWEEPS, SUBSETS, TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
-_OCTAVES = 10  # from the first strength, at most: cones of coarse voxels, and a shell of hardly any noise, take 6 to 9
+SUBSETS, TV_STEPS = 9, 3  # of a trial
+_OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
 TRIALS = 4
 """Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
 CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
-_COARSE = 1.2  # voxels in pixels, from which on they cannot explain the edges of views
-_ALIKE = 0.03  # where voxels are coarse; it gains 2.8 dB on a teapot and 6.8 dB on a thorax in cones (docs/choosing.md)
-_AIR = 0.03  # of the largest line integral: columns below see air
-_BESIDE = 0.05  # of the width of the matter: air that trials see on either side
-_NARROWER = 0.9  # of the columns: wider matter is not worth a cut
-_MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
@@ -64,7 +58,7 @@ def residuals_by_view(differences: F32, views: F32, geometry: Geometry) -> F64:
         views: [view, ...] line integrals.
     """
     if geometry.is_cone:
-        differences[views <= _MATTER * np.nanpercentile(views, 99)] = np.nan
+        differences[views <= OF_MATTER * np.nanpercentile(views, 99)] = np.nan
     counting = [view for view in differences if np.isfinite(view).any()]
     if not counting:
         return np.full(1, np.inf)
@@ -98,18 +92,18 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
 def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
     """The columns of `images` [view, row, col] that see matter, with some air beside it, and the box that holds it.
 
-    None: they are nearly all columns, or rows do not show slices around the detector's middle.
+    None: they are all columns, or rows do not show slices around the detector's middle.
     """
     if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
         return None
     deepest = images.mean(axis=1).max(axis=0)
-    there = np.flatnonzero(deepest > _AIR * deepest.max())
+    there = np.flatnonzero(deepest > AIR * deepest.max())
     axis, width = geometry.axis_col + geometry.shifts[:, 0], geometry.detector_shape[1]
     if not there.size:
         return None
-    half = (1 + 2 * _BESIDE) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
+    half = (1 + 2 * BESIDE_MATTER) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
     first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
-    if stop - first > _NARROWER * width:
+    if stop - first == width:
         return None
     views = replace(
         geometry, detector_shape=(geometry.detector_shape[0], stop - first), axis_col=geometry.axis_col - first
@@ -129,7 +123,7 @@ def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tu
     if np.abs(geometry.shifts[:, 1]).max() > 1 or first < 0 or rows.stop > geometry.detector_shape[0]:
         return None
     some = data[:: max(1, len(data) // 8)]
-    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
+    if np.abs(some[:, rows]).sum() < ENOUGH_MATTER * np.abs(some[:, busiest_rows(some, height)]).sum():
         return None
     # At the far side of the field.
     tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
@@ -151,12 +145,12 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 def is_coarse(geometry: Geometry, grid: Grid) -> bool:
     """Voxels cannot explain the edges of views. A volume that tries has ripples, which views held out hardly show."""
-    return grid.voxel_size >= _COARSE * geometry.sample_pitch
+    return grid.voxel_size >= COARSE * geometry.sample_pitch
 
 
 def alike_of(problem: VoxelProblem) -> float:
     """Share of the least residual, within which the strongest prior is taken: 0 but for coarse voxels."""
-    return _ALIKE if is_coarse(problem.projector.geometry, problem.projector.grid) else 0.0
+    return ALIKE if is_coarse(problem.projector.geometry, problem.projector.grid) else 0.0
 
 
 def choice_sweeps(geometry: Geometry) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recon.base.arrays import F32, median_deviation
+from recon.base.empirical import HALF_OF_MANY, MANY_VIEWS, MOST_BY_RESIDUAL, SETTLED, SHARE_OF_NOISE
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure, noise_level
 from recon.kernels.cpu.tv import total_variation
@@ -16,14 +17,6 @@ from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit
 
 MATTER = 0.05  # of the density unit: voxels above it count
-
-# From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue), within 0.4 dB of the best weight on average.
-# They had 25 to 400 views, 500 to 100 000 photons a pixel, white noise and noise blurred by half a pixel.
-_SHARE = 0.75  # of the weight by the first volume
-_MOST = 4.0  # times the first weight
-# Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many.
-_MANY_VIEWS, _HALF = 0.3, 0.45
-_SETTLED = 3 / 8  # of the sweeps: OS-SIRT-TV with 3 of 40 ended a cement in a cone of 50 views 5.6 dB lower
 
 
 @dataclass(eq=False)
@@ -72,7 +65,7 @@ class NoiseBalance:
         volume = start if first is None else np.maximum(first, 0, out=first)
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
-        share = _SHARE * noise**2 * matter / variation if variation > 0 else 0.0
+        share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
         return cls(share, noise * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
@@ -82,9 +75,9 @@ class NoiseBalance:
         if not (deviation > 0 and self.noise > 0):
             return self.value
         self._least = min(self._least, deviation / self.noise)
-        unexplained = self._done >= math.ceil(_SETTLED * self.sweeps) and self._least > 1
+        unexplained = self._done >= math.ceil(SETTLED * self.sweeps) and self._least > 1
         ratio = self._least if unexplained else self.noise / deviation
-        factor = float(np.clip(ratio**2, 1.0, _MOST))
+        factor = float(np.clip(ratio**2, 1.0, MOST_BY_RESIDUAL))
         self.value = self.first * factor
         return self.value
 
@@ -92,4 +85,4 @@ class NoiseBalance:
 def _by_views(geometry: Geometry) -> float:
     """Factor on the noise by the number of views, over those that determine a slice: π / 2 a column."""
     determined = min(1.0, geometry.n_views / (math.pi / 2 * geometry.detector_shape[1]))
-    return 1 + _MANY_VIEWS * min(max(determined / _HALF - 1, 0.0), 1.0)
+    return 1 + MANY_VIEWS * min(max(determined / HALF_OF_MANY - 1, 0.0), 1.0)

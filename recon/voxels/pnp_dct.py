@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.empirical import FALL, PULL
 from recon.base.noise import noise_beside_structure
 from recon.kernels.cpu.patches import denoise, patch_scratch, pulled_step
 from recon.kernels.cpu.vectors import replace_by_residual
@@ -16,11 +17,6 @@ from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
 STEPS = 5
 """Steps towards the views between two thresholds."""
-TRIAL_STEPS = 15
-"""Steps of a trial of patches, three rounds."""
-
-_PULL = 0.03  # of the largest eigenvalue of AᵀWA
-_FALL = 0.8  # of the threshold, from round to round
 
 
 def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F32:
@@ -45,7 +41,7 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
     bound = problem.decide("bound", lambda: largest_eigenvalue(problem.projector, problem.weight))
     scratch, z, rounds = patch_scratch(x.shape), np.empty_like(x), -(-steps // STEPS)
     for k in range(rounds):
-        threshold = strength * _FALL ** (k - rounds)
+        threshold = strength * FALL ** (k - rounds)
         denoise(x, threshold, problem.nonnegative, scratch, z)
         done = k * STEPS
         if not towards_views(problem, x, z, bound, steps=min(STEPS, steps - done), done=done):
@@ -60,7 +56,7 @@ def towards_views(problem: VoxelProblem, x: F32, z: F32, bound: float, *, steps:
 
     Golub & Varga 1961, Numer. Math. 3, 147. Whether `problem.go_on` was content, which is told `done` and more steps.
     """
-    pull = _PULL * bound
+    pull = PULL * bound
     centre, half = pull + bound / 2, bound / 2
     change, gradient = np.zeros_like(x), np.empty_like(x)
     scale, momentum, pace = problem.scale, 0.0, 1 / centre

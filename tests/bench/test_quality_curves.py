@@ -19,12 +19,12 @@ import recon
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES, QualityCurve
 from recon.base.binning import bin_views
+from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid
 from recon.bench import spheres
 from recon.methods import build, by_name
-from recon.splatting.finish import SWEEPS
 from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp
@@ -99,7 +99,7 @@ def measured(data: F32, geometry: Geometry, truth: F32) -> dict[Kind, list[tuple
         sweep = float(np.median([sweep_seconds(coarse, box, now) for _ in range(5)]))
         for steps in numbers:
             settings = ({counted: steps} if counted else {}) | (
-                {"gaussians": round(share * count), "finish": SWEEPS} if share else {}
+                {"gaussians": round(share * count), "finish": FINISH_SWEEPS} if share else {}
             )
             begin = now()
             method, control = build(by_name(name), settings), recon.RunControl(now=now)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import recon
 from recon.auto import Auto
 from recon.base.decisions import Decisions
-from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Volume
 from recon.voxels import held_out
 from recon.voxels.direct import Fbp
@@ -131,20 +131,6 @@ def test_a_cone_is_tried_in_its_middle_or_at_half_the_resolution(axis_row: float
     found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
     assert found.settings["factor"] == 1.0
     assert where in found.settings["chosen_because"]
-
-
-def test_a_sample_wider_than_the_field_is_left_to_the_method_that_models_what_is_beyond(data: F32) -> None:
-    @dataclass(frozen=True)
-    class Beyond(Scaled):
-        traits: ClassVar[Traits] = replace(Fbp.traits, any_grid=True)
-
-    middle = np.ascontiguousarray(data[:, :, 12:20])
-    views = recon.Geometry.parallel(VIEWS.angles, (40, 8))
-    auto = Auto((Scaled(), Beyond(factor=0.2)))
-    found = recon.reconstruct(middle, views, auto)
-    assert found.settings["factor"] == 0.2
-    assert "wider than the field" in found.settings["chosen_because"]
-    assert recon.reconstruct(data, VIEWS, auto).settings["factor"] == 1.0
 
 
 def test_a_stop_ends_the_trials(data: F32) -> None:

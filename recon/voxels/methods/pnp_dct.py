@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
+from recon.base.empirical import FIRST_THRESHOLD, TRIAL_STEPS, TRIAL_SWEEPS, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
-    TRIAL_SWEEPS,
     TRIALS,
     HeldOutTrial,
     alike_of,
@@ -27,13 +27,9 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
+from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import patch_choice, patch_steps
-
-_FIRST = 8.0  # times the noise of a volume: views held out prefer 7 to 11 on slabs of shell, teapot and walnut
-TRIAL_THRESHOLD = 1.6
-"""Times the strength: after so few steps views held out prefer 1.5 to 1.8 times the threshold (four slabs)."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +52,7 @@ class PnpDct:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        if self.patch_threshold is not None and not 0 <= self.patch_threshold < math.inf:
-            raise ValueError(f"patch_threshold must be finite and 0 or more, got {self.patch_threshold}")
+        check_settings(self, least={"patch_threshold": 0.0})
 
     @property
     def first_sweeps(self) -> int:
@@ -132,13 +127,13 @@ def choose_patches(
 
     The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
     views can be held out. There total variation is taken to predict as well. So it is where voxels are coarse: patches
-    follow the edges within them, and a teapot in a cone loses 1 dB, though they predict better. Neither knows of the
+    follow the edges within them, and a walnut in a cone loses 0.7 dB, though they predict better. Neither knows of the
     densest matter: weak matter beside metal keeps its detail.
     """
 
     def chosen() -> list[float]:
         judge = None if isinstance(weight, NoiseBalance) else trial()
-        first = _FIRST * noise_of_volume(problem if judge is None else judge.problem)
+        first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
         if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
         smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth

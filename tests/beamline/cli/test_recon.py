@@ -15,7 +15,7 @@ from beamline.reconstruct.output_paths import report_beside
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr
-from recon.base.choices import DEFAULT_STEPS
+from recon.base.empirical import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import frames_of, write_flagged
 from tests.recon.prep.ring_score import ring_score

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES
 from recon.assess.time_model import duration_text, next_decibel, next_decibel_of_fit, parse_budget
-from recon.base.choices import DEFAULT_STEPS
+from recon.base.empirical import DEFAULT_STEPS
 from recon.bench import spheres
 from recon.reconstruction import reconstruct
 from recon.splatting.r2 import R2

@@ -33,14 +33,14 @@ def _masses(log_scales: np.ndarray, raw: np.ndarray) -> np.ndarray:
 
 
 @settings(deadline=None, max_examples=30)
-@given(seed=st.integers(0, 1000), large=st.sampled_from([1e-6, 0.05, 1e6]))
-def test_growing_conserves_mass_and_centre_of_mass(seed: int, large: float) -> None:
+@given(seed=st.integers(0, 1000))
+def test_growing_conserves_mass_and_centre_of_mass(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 25
     g = Gaussians.from_physical(
         rng.uniform(-5, 5, (n, 3)), rng.uniform(0.3, 2, (n, 3)), rng.uniform(0.1, 2, n), rng.normal(size=(n, 4))
     )
-    change = _control(g, rng.uniform(0, 1e-4, n), DensityPolicy(large=large))
+    change = _control(g, rng.uniform(0, 1e-4, n), DensityPolicy())
     before, after = _masses(g.log_scales.numpy(), g.raw_densities.numpy()), _masses(change.log_scales, change.raw)
     assert change.parents.size > 0 and after.size == n + change.parents.size
     assert after.sum() == pytest.approx(before.sum(), rel=1e-5)
@@ -50,7 +50,7 @@ def test_growing_conserves_mass_and_centre_of_mass(seed: int, large: float) -> N
 def test_a_split_keeps_the_covariance(random_gaussians: Make) -> None:
     # Mixture of two: covariance of the parts plus that of their centres.
     g = random_gaussians(1)
-    change = _control(g, np.ones(1), DensityPolicy(large=0.0))
+    change = _control(g, np.ones(1), DensityPolicy())
     assert change.means.shape == (2, 3)
     centre = change.means.mean(0)
     parts = covariances(torch.from_numpy(np.exp(change.log_scales)), g.quaternions.repeat(2, 1)).numpy().mean(0)
@@ -111,8 +111,8 @@ def test_the_limit_keeps_the_most_wanted(random_gaussians: Make) -> None:
 
 
 @settings(max_examples=30)
-@given(seed=st.integers(0, 1000), faint=st.integers(0, 12), large=st.sampled_from([1e-6, 0.05, 1e6]))
-def test_at_the_limit_pruning_and_splitting_relocate_at_a_constant_number(seed: int, faint: int, large: float) -> None:
+@given(seed=st.integers(0, 1000), faint=st.integers(0, 12))
+def test_at_the_limit_pruning_and_splitting_relocate_at_a_constant_number(seed: int, faint: int) -> None:
     rng = np.random.default_rng(seed)
     n = 30
     density = rng.uniform(0.1, 2, n)
@@ -122,7 +122,7 @@ def test_at_the_limit_pruning_and_splitting_relocate_at_a_constant_number(seed: 
     g = Gaussians.from_physical(
         rng.uniform(-5, 5, (n, 3)), rng.uniform(0.3, 2, (n, 3)), density, rng.normal(size=(n, 4)), density_unit=1.0
     )
-    change = _control(g, statistic, DensityPolicy(large=large), limit=n)
+    change = _control(g, statistic, DensityPolicy(), limit=n)
     # The room of those that went, and no more, is taken by copies of those most wanted among the rest.
     assert change.raw.size == n and change.parents.size == faint
     left = np.setdiff1d(np.arange(n), dim)
@@ -133,11 +133,3 @@ def test_at_the_limit_pruning_and_splitting_relocate_at_a_constant_number(seed: 
     assert after.sum() == pytest.approx(before[left].sum(), rel=1e-5)
     assert after.sum() == pytest.approx(before.sum(), rel=1e-3)  # what went was next to nothing
     np.testing.assert_allclose(after @ change.means, before[left] @ g.means.numpy()[left], rtol=1e-4, atol=1e-3)
-
-
-def test_clones_do_not_coincide(random_gaussians: Make) -> None:
-    g = random_gaussians(1)
-    change = _control(g, np.ones(1), DensityPolicy(large=1e6))
-    apart = np.linalg.norm(change.means[0] - change.means[1])
-    assert apart == pytest.approx(0.5 * float(g.scales.max()), rel=1e-4)
-    assert math.isclose(*np.logaddexp(0, change.raw), rel_tol=1e-6)
