@@ -247,7 +247,9 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 def results(record: ReconRecord) -> str:
     """The result of a reconstruction: files, grid, then a table of metrics by method."""
     lines = [f"{name:<20}{path}" for name, path in record.outputs.items()] or [f"{'output':<10}{record.output}"]
-    lines += [f"{'report':<10}{record.report}"] if record.report else []
+    if record.report:
+        drawn = record.times.get("report")
+        lines.append(f"{'report':<10}{record.report}" + (f" ({drawn:.1f} s)" if drawn else ""))
     shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
     if len(seconds):
         lines.append(

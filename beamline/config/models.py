@@ -164,7 +164,7 @@ class ReconSection(Section):
     method: MethodName = DEFAULT
     """r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."""
     seconds: Seconds = 30.0
-    """Time for the fit after the last view."""
+    """Time after the last view for the last round of the fit and the sweeps on voxels together."""
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
     stop_when: StopWhen | None = None

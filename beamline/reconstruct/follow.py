@@ -88,6 +88,7 @@ def follow(
         with stop_scope() as should_stop:
             if _watch(follower, clock, rhythm, should_stop):
                 follower.catch_up(should_stop)
+                follower.draw_slices()
             else:
                 n = follower.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")

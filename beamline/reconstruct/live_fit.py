@@ -298,8 +298,8 @@ class ScanFollower:
         message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
         self._sink(StateEntered("gain", message, gain, time=self._clock.now()))
 
-    def draw_slices(self, pause: float) -> None:
-        """Draw slices of the views so far, if there are new ones, and `pause` s have passed.
+    def draw_slices(self, pause: float | None = None) -> None:
+        """Draw slices of the views so far, if there are new ones, and `pause` s have passed (None: at once).
 
         Before the axis is known they are about the middle of the detector.
         """

@@ -29,13 +29,17 @@ class LiveSlices:
         self._views, self._snapshots, self._clock = views, snapshots, clock
         self._newest, self._next = -1, -math.inf  # the last view drawn; the time from which they are drawn again
 
-    def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float, of: int = 0) -> None:
+    def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
         """Draw slices of corrected views about the axis (a column of the file; None: the middle of the detector).
 
-        `of`: so many views are there, of which these are some. Views of a cone, or that lean or climb, have no slices.
+        Views of a cone, or that lean or climb, have no slices.
+
+        Args:
+            pause: s until they are drawn again, at least; None: they are drawn now.
+            of: so many views are there, of which these are some; 0: these.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
-        if n < _FEWEST or begin < self._next or int(parts[-1].view_ids[-1]) == self._newest:
+        if n < _FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
             return
         ids = np.concatenate([part.view_ids for part in parts])
         col = (self._views.source.shape[1] - 1) / 2 if axis_col is None else axis_col
@@ -48,12 +52,13 @@ class LiveSlices:
             heading = f"FBP of {count} views so far{coverage}, axis at {place}"
             self._snapshots.write_slices(slices, n, heading)
         end = self._clock.now()
-        self._newest, self._next = int(ids[-1]), end + max(pause, end - begin)
+        self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
-    def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float) -> None:
+    def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float | None) -> None:
         """Draw slices before the axis is known, of some of the views, corrected for this alone."""
         views = self._views.chosen(self._views.usable().frames)
-        if views.size < _FEWEST or self._clock.now() < self._next or int(views[-1]) == self._newest:
+        early = pause is not None and self._clock.now() < self._next
+        if views.size < _FEWEST or early or int(views[-1]) == self._newest:
             return
         with suppress(DataError):  # views without light, say: the scan goes on, and so does the fit
             self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
