@@ -1,6 +1,6 @@
 """The published R²-Gaussian beside ours, and what each departure from it gains; pytest -m bench -s tests/bench.
 
-CURVE_SECONDS=15,60,240 CURVE_STEPS=3000,30000 pytest -m bench -s tests/bench/test_published.py -k "against_time and teapot"
+CURVE_SECONDS=15,60 CURVE_STEPS=3000,30000 pytest -m bench -s tests/bench/test_published.py -k "against_time and shell"
 """
 
 from __future__ import annotations
