@@ -396,6 +396,8 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
     control = replace(control, stop_trials=None if length.trials else lambda: True)
     coarse = is_coarse(run.views.fitted.geometry, volume.grid)
     share = share_of_prior(method.fit, run.state.step) if coarse else 1.0
+    if method.finish is None and length.sweeps is not None:  # those that the time suffices for
+        length.sweeps = max(1, round(share * length.sweeps))
     finished, sweeps = finish(
         volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative, share
     )  # fmt: skip

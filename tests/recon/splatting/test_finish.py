@@ -239,11 +239,11 @@ def test_a_stop_ends_the_trials() -> None:
 @pytest.mark.parametrize(("voxels", "sweeps", "seconds"), [(24, 8, None), (12, 4, 1e9)])
 def test_a_longer_fit_changes_less(voxels: int, sweeps: int, seconds: float | None) -> None:
     """Four times the steps: half the rates, and half the finish where voxels are coarse; so by a clock, too."""
-    cone = Geometry.cone(np.linspace(0, 2 * math.pi, 20, endpoint=False), (24, 24), 1.0, 60.0, 72.0)
+    cone = Geometry.cone(np.linspace(0, 2 * math.pi, 12, endpoint=False), (24, 24), 1.0, 60.0, 72.0)
     grid = Grid((voxels,) * 3, 24 * cone.sample_pitch / voxels)
     data = Projector(cone, grid).forward(np.pad(np.full((6, 6, 6), 0.1, np.float32), (voxels - 6) // 2))
     settings = FitSettings(paced_for=2, tv_size=8)
     method = R2(steps=8, seconds=seconds, gaussians=30, fit=settings)
     made = reconstruct(data, cone, method, grid=grid).settings
-    assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 4)
+    assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 2)
     assert made["finish"] == sweeps

@@ -39,7 +39,7 @@ def test_a_longer_fit_is_slower_and_asks_less_of_its_prior() -> None:
     usual = FitSettings()
     assert in_steps(usual, 50) == in_steps(usual, 400) == usual and share_of_prior(usual, 400) == 1
     longer = in_steps(usual, 1600)
-    assert (longer.pace, longer.tv_least, share_of_prior(usual, 1600)) == (13.0, 0.005, 0.5)
+    assert (longer.pace, longer.tv_least, share_of_prior(usual, 1600)) == (13.0, 0.01, 0.5)
 
 
 _WITHOUT_LIMITS = {noise: 3e5 * noise**2 / 24 for noise in (1e-4, 2e-3, 4e-3, 0.1)}
