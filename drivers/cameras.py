@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
-from drivers.plugins import plugins
 from drivers.stages.settings import with_keys
+from splatline.registry import Registry
 
 
 class CameraDriver(Protocol):
@@ -28,5 +27,5 @@ class CameraDriver(Protocol):
         """The camera's timing, before it is connected. ValueError for settings that it would refuse."""
 
 
-CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"), with_keys)
+CAMERAS: Registry[CameraDriver] = Registry("camera", {}, with_keys, reserved=("dcam", "simulated_orca"))
 """Kind in a configuration -> the driver."""

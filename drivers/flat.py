@@ -42,14 +42,14 @@ def flat_fields(settings: type[Any]) -> list[FlatField]:
 
 
 def _fields_of(settings: type[Any], defaults: Any) -> list[FlatField]:
-    hints, found = get_type_hints(settings), list[FlatField]()
+    hints, flat_fields = get_type_hints(settings), list[FlatField]()
     for field in fields(settings):
         default = field.default if defaults is MISSING else getattr(defaults, field.name)
         if is_dataclass(hints[field.name]):
-            found += _fields_of(hints[field.name], default)
+            flat_fields += _fields_of(hints[field.name], default)
         else:
-            found.append(FlatField(field.name, hints[field.name], default, field.metadata))
-    return found
+            flat_fields.append(FlatField(field.name, hints[field.name], default, field.metadata))
+    return flat_fields
 
 
 def from_flat(settings: type[T], values: Mapping[str, Any]) -> T:

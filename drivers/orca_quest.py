@@ -11,6 +11,7 @@ from __future__ import annotations
 from types import MappingProxyType
 
 from drivers.base.protocols import CameraSettings, CameraTiming
+from splatline.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)
 PITCH_MM = 4.6e-3
@@ -34,7 +35,7 @@ LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpre
 def refusal(settings: CameraSettings, model: str = MODEL) -> str:
     """Reason for which the camera would refuse the settings, with the legal values; "" if it takes them."""
     if settings.readout not in LINE_TIME:
-        return f"readout {settings.readout!r} is unknown; legal: {', '.join(LINE_TIME)}"
+        return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:
         return f"binning {settings.binning} is not offered; legal: {', '.join(map(str, BINNINGS))}"
     shortest = LINE_TIMES[model][settings.readout]

@@ -61,13 +61,13 @@ def preflight(
     fields = {"idVendor": vendor} if product is None else {"idVendor": vendor, "idProduct": product}
     wanted = f"{vendor:04x}:{'*' if product is None else f'{product:04x}'}"
     try:
-        found = [_describe(device) for device in usb.core.find(find_all=True, backend=backend, **fields)]
+        connected = [_describe(device) for device in usb.core.find(find_all=True, backend=backend, **fields)]
     except usb.core.NoBackendError:
         return Preflight(Verdict.UNKNOWN, "USB cannot be checked: libusb is not installed on this machine.")
     except usb.core.USBError as error:
         return Preflight(Verdict.UNKNOWN, f"USB cannot be checked: {error}.")
     # A device whose serial number cannot be read may be the requested one.
-    devices = tuple(device for device in found if not (serial and device.serial and device.serial != serial))
+    devices = tuple(device for device in connected if not (serial and device.serial and device.serial != serial))
     if not devices:
         which = f"{wanted} with serial number {serial}" if serial else wanted
         message = f"No USB device {which} is connected (a CoaXPress camera does not show on USB)."

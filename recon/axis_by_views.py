@@ -77,9 +77,9 @@ def axis_by_views(
         progress(n)
 
     with suppress(AxisError):
-        found = _search(views, counted, 1.0, near)
-        if found.confident:
-            return found
+        estimate = _search(views, counted, 1.0, near)
+        if estimate.confident:
+            return estimate
     before = tried
     return _search(views, lambda n: progress(before + n), _WIDER, near)
 
@@ -116,15 +116,15 @@ def _search(views: _Views, progress: Callable[[int], None], width: float, near: 
             f"with column {best:.1f}, at the edge of the search; give the axis"
         )
     clear = coarse(best) < (1 - _CLEAR) * typical
-    found = _vertex(fine, best, half)
+    estimate = _vertex(fine, best, half)
     for _ in range(_STEPS):
-        if found is None or abs(found.axis_col - best) <= half:
+        if estimate is None or abs(estimate.axis_col - best) <= half:
             break
-        best += half * np.sign(found.axis_col - best)
-        found = _vertex(fine, best, half)
-    if found is None:
+        best += half * np.sign(estimate.axis_col - best)
+        estimate = _vertex(fine, best, half)
+    if estimate is None:
         return _estimate(best, coarse, confident=False)
-    return _estimate(found.axis_col, coarse, confident=clear)
+    return _estimate(estimate.axis_col, coarse, confident=clear)
 
 
 @dataclass(frozen=True)

@@ -92,10 +92,10 @@ def error_bars(
     if method.traits.direct:
         difference = _alternating(method, problem)
     else:
-        found = _refitted(method, problem, volume, decided, control)
-        if found is None:
+        refitted = _refitted(method, problem, volume, decided, control)
+        if refitted is None:
             return None
-        difference, made = found
+        difference, made = refitted
     gradient = _gradient(volume.data)
     decide = Decisions(problem.seed, decided)
     classes = 1 if method.traits.direct else _CLASSES  # the noise of FBP knows no edges
@@ -164,10 +164,10 @@ def _refitted(
             control.on_progress(
                 Progress(done, 2 * sweeps, seconds, math.nan, math.nan, 0, n, unit="sweeps of error bars")
             )
-        stopped = stopped or (control.should_stop is not None and control.should_stop())
+        stopped = stopped or control.stop()
         return stopped
 
-    found: list[F32] = []
+    volumes: list[F32] = []
     for sign in (1, -1):
         trust = np.broadcast_to(1 + np.float32(sign * _EXTRA) * signs, data.shape)
         decide = Decisions(problem.seed, follow)
@@ -178,8 +178,8 @@ def _refitted(
         if stopped:
             return None
         follow = decide.made
-        found.append(refitted.data)
-    more, less = found
+        volumes.append(refitted.data)
+    more, less = volumes
     more -= less
     more *= np.float32(0.5 / _EXTRA)
     return more, follow

@@ -11,6 +11,7 @@ import numpy as np
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.base.work import Costs
 from recon.energy_fit import EnergyViews
@@ -47,9 +48,7 @@ class TimeSeries:
     weight: float | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.volumes, bool) or not isinstance(self.volumes, int) or self.volumes < 2:
-            raise ValueError(f"volumes must be a whole number, 2 or more, got {self.volumes!r}")
-        _require_fit(self.sweeps, self.weight)
+        check_settings(self, whole={"volumes": 2, "sweeps": 1}, least={"weight": 0.0})
 
     @property
     def volume_names(self) -> tuple[str, ...]:
@@ -69,7 +68,7 @@ class TimeSeries:
             sweeps=self.sweeps,
             seed=problem.seed,
             go_on=history.heard,
-            stop=history.stopped,
+            stop=control.stop,
         )
         series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
         settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
@@ -122,7 +121,7 @@ class EnergySeries:
             raise ValueError(
                 f"states are {','.join(self.states)}: expected two of the materials {', '.join(self.materials)}"
             )
-        _require_fit(self.sweeps, self.weight)
+        check_settings(self, whole={"sweeps": 1}, least={"weight": 0.0})
 
     @property
     def volumes(self) -> int:
@@ -151,14 +150,14 @@ class EnergySeries:
             sweeps=self.sweeps,
             seed=problem.seed,
             go_on=history.heard,
-            stop=history.stopped,
+            stop=control.stop,
         )
         settings: dict[str, Any] = {"materials": ",".join(self.materials), "sweeps": self.sweeps}
         settings |= {"weights": made.weights}
-        if self.states and not history.stopped():
+        if self.states and not control.stop():
             first, second = (self.materials.index(state) for state in self.states)
             free = made
-            made = fit_share(views, free, (first, second), history.heard_share, history.stopped)
+            made = fit_share(views, free, (first, second), history.heard_share, control.stop)
             settings |= {"states": ",".join(self.states)} if made is not free else {}
         series = VolumeSeries(np.empty(0), made.densities, made.residual, self.materials)
         return history.result(series, made.grid, settings)
@@ -187,10 +186,6 @@ class _History:
     def __post_init__(self) -> None:
         self.began = self.control.now()
 
-    def stopped(self) -> bool:
-        """Somebody stops the fit."""
-        return self.control.should_stop is not None and self.control.should_stop()
-
     def heard(self, sweep: int, residual: float) -> bool:
         """As `fit_series` and `fit_materials` call their `go_on`."""
         if sweep > 0:
@@ -199,12 +194,12 @@ class _History:
             self.tried += 1
             self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
             self.tried = 0 if sweep == 0 else self.tried
-        return not self.stopped()
+        return not self.control.stop()
 
     def heard_share(self, steps_to_come: int) -> bool:
         """As `fit_share` calls its `go_on`."""
         self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
-        return not self.stopped()
+        return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
         """Of a sweep of the fit."""
@@ -225,14 +220,6 @@ class _History:
 
 def _progress(n: int, of: int, unit: str) -> Progress:
     return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
-
-
-def _require_fit(sweeps: int, weight: float | None) -> None:
-    """ValueError for other settings than a fit takes."""
-    if isinstance(sweeps, bool) or not isinstance(sweeps, int) or sweeps < 1:
-        raise ValueError(f"sweeps must be a whole number, 1 or more, got {sweeps!r}")
-    if weight is not None and not (math.isfinite(weight) and weight >= 0):
-        raise ValueError(f"weight must be finite and 0 or more, got {weight!r}")
 
 
 def _require_own_grid(problem: ReconProblem) -> None:

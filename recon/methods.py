@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from importlib import import_module
 from typing import Any, Literal
 
-from drivers.plugins import plugins
 from recon.base.choices import AUTO
 from recon.base.method import Method
+from splatline.registry import Registry
 
 
 @dataclass(frozen=True)
@@ -63,19 +62,34 @@ IN_TIME = "series"  # The method of volumes in time
 BASELINE = "fbp"  # Reports compare all methods with this one
 
 
+def _made(name: str, method: type[Method]) -> MethodEntry:
+    """The line of another package's method."""
+    if method.name != name:
+        raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
+    entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
+    if getattr(import_module(entry.module), entry.cls, None) is not method:
+        raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
+    _ = method(), method.label, method.traits.direct  # every setting has a default
+    return entry
+
+
+METHODS = Registry("method", REGISTRY, _made, reserved=(AUTO,))
+"""All methods, with those of other packages."""
+
+
 def names() -> tuple[str, ...]:
     """Names of all methods; loads no module of ours."""
-    return tuple(_entries())
+    return tuple(METHODS)
 
 
 def names_of_one_volume() -> tuple[str, ...]:
     """Names of the methods that make one volume of all views, as rows of a table do; loads no module of ours."""
-    return tuple(name for name, entry in _entries().items() if not entry.several)
+    return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 
 def names_of_one_scan() -> tuple[str, ...]:
     """Names of the methods that take one scan; loads no module of ours."""
-    return tuple(name for name, entry in _entries().items() if entry.several != "materials")
+    return tuple(name for name, entry in METHODS.items() if entry.several != "materials")
 
 
 def names_compared(emission: bool = False) -> tuple[str, ...]:
@@ -89,7 +103,7 @@ def streams(name: str) -> bool:
     Raises:
         ValueError: for an unknown name.
     """
-    return _entry(name).streams
+    return METHODS[name].streams
 
 
 def by_name(name: str) -> type[Method]:
@@ -98,13 +112,13 @@ def by_name(name: str) -> type[Method]:
     Raises:
         ValueError: for an unknown name.
     """
-    entry = _entry(name)
+    entry = METHODS[name]
     return getattr(import_module(entry.module), entry.cls)
 
 
 def taking(field: str) -> tuple[str, ...]:
     """Names of the methods that have a setting, such as "iterations", or "fit.loss" within another one."""
-    return tuple(name for name in _entries() if has_setting(by_name(name), field))
+    return tuple(name for name in METHODS if has_setting(by_name(name), field))
 
 
 def has_setting(method: type[Method], field: str) -> bool:
@@ -145,26 +159,4 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
 
 def with_trait(trait: str) -> tuple[str, ...]:
     """Names of the methods with a trait, a field of `recon.base.method.Traits`."""
-    return tuple(name for name in _entries() if getattr(by_name(name).traits, trait))
-
-
-@cache
-def _entries() -> Mapping[str, MethodEntry]:
-    """Ours, and those of other packages."""
-
-    def made(name: str, method: type[Method]) -> MethodEntry:
-        if method.name != name:
-            raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
-        entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
-        if getattr(import_module(entry.module), entry.cls, None) is not method:
-            raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
-        _ = method(), method.label, method.traits.direct  # every setting has a default
-        return entry
-
-    return {**REGISTRY, **plugins("method", (*REGISTRY, AUTO), made)}
-
-
-def _entry(name: str) -> MethodEntry:
-    if name not in _entries():
-        raise ValueError(f"method must be one of {', '.join(_entries())}, got {name!r}")
-    return _entries()[name]
+    return tuple(name for name in METHODS if getattr(by_name(name).traits, trait))

@@ -65,9 +65,9 @@ def register_energies(
     if not after < _HELPS * before:
         return views, tuple(still)
     least = 2 * _MOVES / views.projections.shape[2]
-    found = [move if abs(move.magnification - 1) > least else replace(move, magnification=1.0) for move in moves]
-    seen = _unmagnified(views, found, (rows.start + looked.geometry.axis_row, views.geometry.axis_col))
-    return replace(seen, geometry=displaced(views.geometry, views.energy, found)), tuple(found)
+    moves_kept = [move if abs(move.magnification - 1) > least else replace(move, magnification=1.0) for move in moves]
+    seen = _unmagnified(views, moves_kept, (rows.start + looked.geometry.axis_row, views.geometry.axis_col))
+    return replace(seen, geometry=displaced(views.geometry, views.energy, moves_kept)), tuple(moves_kept)
 
 
 def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tuple[float, float]) -> EnergyViews:

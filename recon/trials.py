@@ -67,11 +67,8 @@ def predicts_best(
     refused: list[str] = []
     decided: dict[str, Sequence[Any]] = {}
 
-    def stopped() -> bool:
-        return control.should_stop is not None and control.should_stop()
-
     for done, at in enumerate(order or range(len(methods)), 1):
-        if stopped():
+        if control.stop():
             break
         method = _candidate(methods[at])
         device, decide = part.device if method.traits.device else "cpu", Decisions(part.seed, decided)
@@ -82,7 +79,7 @@ def predicts_best(
         except ValueError as error:
             refused.append(f"{method.name}: {error}")
             continue
-        if stopped():
+        if control.stop():
             break
         decided.update(prior_decisions(decide.made))
         residuals[at] = _residuals(made, method, judge)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,6 +25,8 @@ from recon.voxels.view_weights import cone_weights, missing_arc
 _SHAPE, _VIEWS = (12, 16), 4
 _SEVERAL = 12  # times these views, for methods of several volumes
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
+_RECONSTRUCTED: set[tuple[object, ...]] = set()
+"""Toys, with what they were reconstructed by, whose kernels this process has loaded."""
 
 
 def warm_up(
@@ -36,7 +39,8 @@ def warm_up(
 ) -> None:
     """Reconstruct a toy: a fit takes 1 to 2 minutes the first time on a machine, a fraction of a second later.
 
-    numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
+    A process reconstructs each toy once. numba keeps what it compiles beside the package (or in the user's cache
+    folder), once for each kind of processor.
     Kernels for another kind of geometry, first volume or ray are compiled only for it. Leaning views, a cone or weights
     add a sixth of that time. A start by TV adds a third, a short scan of a cone with exact rays two thirds.
 
@@ -60,7 +64,10 @@ def warm_up(
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
-            reconstruct(data, views, warmed.toy(), device=device if warmed is method else "cpu", use=DataUse(weights))
+            toy, on = warmed.toy(), device if warmed is method else "cpu"
+            if (key := (type(toy), repr(toy), pickle.dumps(views), on, weighted)) not in _RECONSTRUCTED:
+                reconstruct(data, views, toy, device=on, use=DataUse(weights))
+                _RECONSTRUCTED.add(key)
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
 

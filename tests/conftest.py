@@ -94,10 +94,32 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """A tenth of the time of collecting went into looking for garbage."""
+    if not getattr(session.config.option, "numprocesses", None):  # workers collect, not who leads them
+        gc.disable()
+
+
 def pytest_collection_finish() -> None:
     """What is loaded now lives to the end: the garbage collector need not look through it time and again."""
     gc.collect()
     gc.freeze()
+    gc.enable()
+
+
+# Not in processes that tests start, some of which run tests of another folder.
+_SKIPPED = os.environ.pop("SPLATLINE_SKIPPED", None) if "PYTEST_XDIST_WORKER" in os.environ else None
+
+
+def _note_skipped(report: pytest.CollectReport | pytest.TestReport) -> None:
+    """The gate runs what a worker skipped again, with all extras: it names a file for that in SPLATLINE_SKIPPED."""
+    if _SKIPPED and report.skipped and not hasattr(report, "wasxfail"):
+        with Path(_SKIPPED).open("a", encoding="utf-8") as file:
+            file.write(report.nodeid + "\n")
+
+
+pytest_runtest_logreport = pytest_collectreport = _note_skipped
 
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -124,11 +124,11 @@ class Instrument:
         self, config: Config, output: str | Path | None, live: bool, stop: StopRequest,
         on_event: Callable[[Event], None] | None,
     ) -> ScanResult:  # fmt: skip
-        self.last, said = None, list[ScanDone | ReconDone]()
+        self.last, ends = None, list[ScanDone | ReconDone]()
 
         def remember(event: Event) -> None:
             if isinstance(event, ScanDone | ReconDone):
-                said.append(event)
+                ends.append(event)
 
         def say(event: Event) -> None:
             if self._say is not None and not isinstance(event, RunDone) and (text := sentence(event)):
@@ -148,7 +148,7 @@ class Instrument:
             if not stop.enough:
                 raise
         finally:
-            self.last = _result(said)
+            self.last = _result(ends)
         assert self.last is not None
         return self.last
 

@@ -89,12 +89,15 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     watch = watched(folder)
     while True:
         over = describe(folder).state in _OVER  # asked before the volume, so that none is missed
-        found = newest(watch.volumes)
-        if found is not None and found != shown:
-            with suppress(DataError), opened_volume(found.path) as record:  # the next volume is taking its place
+        newest_volume = newest(watch.volumes)
+        if newest_volume is not None and newest_volume != shown:
+            with (
+                suppress(DataError),
+                opened_volume(newest_volume.path) as record,
+            ):  # the next volume is taking its place
                 volume = replace(record.volume, data=np.array(record.volume.data))
-                shown = found
-            if shown is found:
+                shown = newest_volume
+            if shown is newest_volume:
                 yield volume
         if over:
             return

@@ -107,8 +107,8 @@ def selection_of(
     binning: int | None,
 ) -> Selection:
     """The selection with what is said beside it."""
-    said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
-    return replace(selection or Selection(), **{name: value for name, value in said.items() if value is not None})
+    stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
+    return replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
 
 
 @contextmanager

@@ -157,15 +157,15 @@ class _Frames(DetectorAcquireLogic):
                         return
                     camera.software_trigger()
                     triggered = self._clock.now()
-                if (found := self._next(exposure + PATIENCE if by_software else math.inf)) is None:
+                if (frame_taken := self._next(exposure + PATIENCE if by_software else math.inf)) is None:
                     return
-                if found.framestamp != i:
+                if frame_taken.framestamp != i:
                     raise InstrumentError(
-                        f"{camera.name}: frame {found.framestamp} came, and {i} was expected: frames are lost. Take "
-                        "them again with more time between them. What was taken before is in the file."
+                        f"{camera.name}: frame {frame_taken.framestamp} came, and {i} was expected: frames are lost. "
+                        "Take them again with more time between them. What was taken before is in the file."
                     )
                 row = writer.rows
-                frame = Frame(np.array(found.counts), kind, row, row, i, angle, found.time, exposure)
+                frame = Frame(np.array(frame_taken.counts), kind, row, row, i, angle, frame_taken.time, exposure)
                 writer.append(frame, digest(frame.counts, 2**camera.timing.bits - 1, self._config.storage.preview_bin))
                 loop.call_soon_threadsafe(self._set_rows, writer.committed)
         finally:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.options import (
+    dataset_option,
     json_events,
     json_option,
     parsed,
@@ -79,9 +80,7 @@ class ExportRequest:
     at: int | None = set_by(
         "--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
     )
-    dataset: str | None = set_by(
-        "--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes."
-    )
+    dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)
 
 

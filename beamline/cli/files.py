@@ -86,7 +86,7 @@ def info(
     for name, value in (facts | attributes).items():
         click.echo(f"{name:<{width}}{_text(value)}")
     for view in returned:
-        click.echo(f"{'on the way back':<{width}}{view.said()}")
+        click.echo(f"{'on the way back':<{width}}{view.in_words()}")
     for message in findings:
         click.echo(f"! {message}")
 
@@ -117,11 +117,11 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
             if light is not None:
                 light.refuse_impossible(source)
             statistics = statistics_of(source, counting("statistics", sink, clock))
-            dose = [] if light is None else light_of(source, statistics, light).said()
+            dose = [] if light is None else light_of(source, statistics, light).in_words()
         rows = table(statistics)
         if output is not None:
             write_whole(output, histograms(statistics))
-        facts = {kind: dict(zip(rows[0][1:], said, strict=True)) for kind, *said in rows[1:]}
+        facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
         sink(Done({**facts, "light": dose, "output": output}, time=clock.now()))
     if as_json:
         return
@@ -217,7 +217,7 @@ def recover(file: Path, as_json: bool) -> None:
         for done in recovered:
             sink(Done(done, time=SystemClock().now()))
     if not as_json:
-        click.echo("\n".join(done.said() for done in recovered))
+        click.echo("\n".join(done.in_words() for done in recovered))
 
 
 @click.command()

@@ -240,14 +240,14 @@ class LazyGroup(click.Group):
         except (Exit, Abort, ClickException):
             raise
         except BaseException as error:  # SystemExit, too, which is 0 by itself: no command of ours raises it
-            said = user_message(error)
+            message = user_message(error)
             if is_defect(error):
                 if ctx.params.get("debug"):
                     raise
                 left = leave_traceback(error, Path())
-                said += f"; the traceback is in {left}" if left else "; --debug shows where"
-                said += ". Please report it. What was written before is as it was written."
-            click.echo(f"beamline: {printable(said)}", err=True)
+                message += f"; the traceback is in {left}" if left else "; --debug shows where"
+                message += ". Please report it. What was written before is as it was written."
+            click.echo(f"beamline: {printable(message)}", err=True)
             ctx.exit(exit_code(error))
 
 

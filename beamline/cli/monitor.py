@@ -89,7 +89,7 @@ def monitor(request: MonitorRequest) -> None:
         if again := summed.retaken:
             end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
         left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
-        back = [f"On the way back: {view.said()}." for view in returned]
+        back = [f"On the way back: {view.in_words()}." for view in returned]
         drift = [summed.drift] if summed.drift else []
         lines = [*table(summed.kinds), *references, *altered, *drift, *left_out, *back, *watched.ended, end]
         click.echo("\n".join(lines))
@@ -115,10 +115,8 @@ def _watched(
 ) -> _Watched:
     """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
     from beamline.projections.flagged_frames import worst_frames
-    from beamline.projections.rendered import rendered
     from beamline.projections.replay import replay, verdict
     from beamline.projections.returned import returned_views
-    from beamline.report.contact_sheet import contact_sheet
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
     from beamline.storage.rules.validate import scan_ended
@@ -128,7 +126,11 @@ def _watched(
     active: set[tuple[str, Level]] = set()
     stopping, opened = StopOnSignal("Stopping."), SourceOptions(request.file, **request.values)
     with opened.open(follow=request.follow) as source, stopping() as stopped:
-        model = None if request.volume is None else rendered(request.volume, source)
+        model = None
+        if request.volume is not None:
+            from beamline.projections.rendered import rendered  # loads numba
+
+            model = rendered(request.volume, source)
         for judged in replay(source, checks, model=model, follow=follow, should_stop=stopped):
             frames.append(judged)
             if not request.follow:
@@ -144,6 +146,8 @@ def _watched(
         if request.sheet is not None:
             worst = worst_frames(source, FrameFlags.of_flags([judged.flags for judged in frames]))
             if worst:
+                from beamline.report.contact_sheet import contact_sheet
+
                 write_whole(request.sheet, contact_sheet(worst))
         return _Watched(summed, returned, ended, stopped())
 

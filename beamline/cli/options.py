@@ -120,6 +120,8 @@ json_option = option(
     "--json", "as_json", is_flag=True, of_one_call=True, repeated=False,
     help="Print one JSON event per line to stdout.",
 )  # fmt: skip
+seed_option = option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+dataset_option = option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
 dry_option = option(
     "--dry-run", "dry", is_flag=True, repeated=False,
     help="Print what would run, the time and memory it will take and what would be written, and end.",

@@ -19,6 +19,7 @@ from click.core import ParameterSource
 from beamline.cli.options import Declared, name_of
 from beamline.cli.options import option as declared_option
 from beamline.core.files import SETTINGS, require_regular, text_in
+from splatline.registry import unknown
 
 _RAW = "beamline.raw"
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
@@ -148,7 +149,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
     defaults: dict[str, Any] = {}
     for name, text in _read(value).items():
         if name not in options:
-            raise click.BadParameter(f"{value}: {name!r} is no option of a recipe; expected {', '.join(options)}")
+            raise click.BadParameter(f"{value}: {unknown('option of a recipe', name, options)}")
         if not isinstance(text, str) or not text:
             raise click.BadParameter(
                 f"{value}: {name} holds no text or several; expected one value, as on the command line"

@@ -168,7 +168,6 @@ def _reconstruct(options: ReconOptions, values: Mapping[str, Any]) -> None:
         from beamline.reconstruct.offline import reconstruct_file
 
         reconstruct = reconstruct_file
-
     last: list[Event] = []
     stop = StopOnSignal(ready=values["follow"] or options.budget is not None)
 

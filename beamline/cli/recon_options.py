@@ -13,12 +13,12 @@ from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
-    SEED,
     json_option,
     option,
     parsed,
     run_option,
     scan_argument,
+    seed_option,
     together,
     volume_path,
 )
@@ -95,7 +95,7 @@ recon_options = together(
         help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
     ),
     heading(METHOD),
-    option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."),
+    seed_option,
     heading(OUTPUT),
     run_option(
         "--uncertainty",

@@ -187,7 +187,7 @@ def _run_energies(config: Config, request: ScanRequest, json_sink: Sink) -> None
     if not request.as_json:
         click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
-    if faults := [said for result in done.results for said in _faults(result)]:
+    if faults := [fault for result in done.results for fault in _faults(result)]:
         raise AlarmError(f"The scans are complete, but {' '.join(faults)} Look at {done.folder}.")
 
 
@@ -211,12 +211,12 @@ def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
     from beamline.scan.resume import recover_run
 
     recovered, left_out = recover_run(run)
-    for said in left_out:
-        click.echo(f"Warning: {said}", err=True)
+    for warning in left_out:
+        click.echo(f"Warning: {warning}", err=True)
     for done in recovered:
         json_sink(Done(done, time=SystemClock().now()))
         if not as_json:
-            click.echo(done.said())
+            click.echo(done.in_words())
 
 
 def _faults(result: RunResult) -> list[str]:
@@ -243,7 +243,7 @@ def _treated(path: Path) -> str:
 
     with suppress(DataError), open_scan(path) as source:
         views = source.image_key == FrameKind.PROJECTION
-        return "" if source.flags is None else treatment_of(source.flags, views, source.shape).said
+        return "" if source.flags is None else treatment_of(source.flags, views, source.shape).in_words
     return ""
 
 
@@ -266,7 +266,7 @@ def _results(result: RunResult) -> str:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
     if result.retaken:
         lines.append(f"{'retaken':<10}{result.retaken} flagged views; `beamline recon` uses the new ones")
-    lines += [f"{'returned':<10}{view.said()}" for view in result.returned]
+    lines += [f"{'returned':<10}{view.in_words()}" for view in result.returned]
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
         if report := result.recon.get("report"):

@@ -99,7 +99,6 @@ def simulate(request: SimulateRequest) -> None:
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
-    from beamline.simulate.figure import sheet
     from beamline.simulate.scene_file import exposure_errors, open_emission, open_scene, scan_of
     from beamline.simulate.write import check_output
 
@@ -137,6 +136,8 @@ def simulate(request: SimulateRequest) -> None:
                 outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
             if picture and not (written and written.stopped):
                 marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
+                from beamline.simulate.figure import sheet  # matplotlib takes a second
+
                 write_whole(picture, sheet(scan, marked))
                 outputs |= {"picture": picture}
                 output("picture", str(picture))
@@ -186,10 +187,10 @@ class _Output:
 def _explain(scan: Scan, output: _Output) -> None:
     from beamline.simulate.scene_file import cost_table, frame_cost
 
-    found, where = frame_cost(scan, time.perf_counter), machine()
-    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
-    output.event(CostExplained(asdict(found) | {"costs": costs, "machine": where}))
-    output.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
+    cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
+    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]
+    output.event(CostExplained(asdict(cost_of_frame) | {"costs": costs, "machine": where}))
+    output.lines(f"{machine_line(where)}\n\n{cost_table(cost_of_frame)}")
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict[str, object]:

@@ -13,12 +13,12 @@ import click
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
-    SEED,
     dry_option,
     json_option,
     others,
     refuse_contradictions,
     scan_argument,
+    seed_option,
     set_by,
     with_request,
 )
@@ -74,7 +74,7 @@ class StudyRequest:
         show_default=True,
         help="How often the study random draws its views.",
     )
-    seed: int = set_by("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+    seed: int = set_by(seed_option)
     dry: bool = set_by(dry_option)
     output: Path | None = set_by(
         heading(OUTPUT),

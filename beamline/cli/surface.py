@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.options import FiniteRange, json_option, parsed, refuse_shared, volume_argument
+from beamline.cli.options import FiniteRange, dataset_option, json_option, parsed, refuse_shared, volume_argument
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
@@ -30,7 +30,7 @@ def _mesh_path(text: str) -> Path:
 @click.option("--level", type=FiniteRange(), help="Value at the surface. Default: half-way between air and matter.")
 @click.option("--from", "source", type=click.Choice(["volume", "gaussians"]), default="volume", show_default=True,
               help="The voxels, or the Gaussians behind them: a fit before its finish.")  # fmt: skip
-@click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
+@dataset_option
 @json_option
 def surface(volume: Path, output: Path, level: float | None, source: str, dataset: str | None, as_json: bool) -> None:
     """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm where the voxel is known).

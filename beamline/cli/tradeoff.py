@@ -15,13 +15,13 @@ from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import (
     POSITIVE,
-    SEED,
     dry_option,
     json_option,
     names_in,
     others,
     parsed,
     refuse_contradictions,
+    seed_option,
     set_by,
     with_request,
 )
@@ -32,14 +32,14 @@ from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
 from recon.methods import names_compared, names_of_one_volume
+from splatline.registry import unknown
 
 
 def listed(value: str) -> tuple[str, ...]:
     """Names of methods, separated by commas. ValueError for another name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
-    unknown = [name for name in wanted if name not in names_of_one_volume()]
-    if unknown:
-        raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names_of_one_volume())}")
+    if others := [name for name in wanted if name not in names_of_one_volume()]:
+        raise ValueError(unknown("method", others[0], names_of_one_volume()))
     return wanted
 
 
@@ -104,9 +104,7 @@ class TradeoffRequest:
         "would not fit is not begun.",
     )
     dry: bool = set_by(dry_option)
-    seed: int = set_by(
-        heading(METHOD), "--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers."
-    )
+    seed: int = set_by(heading(METHOD), seed_option)
     output: Path | None = set_by(
         heading(OUTPUT),
         "-o",

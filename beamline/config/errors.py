@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.config.tree import KeyPath, Tree
+from splatline.registry import nearest
 
 Schema = Mapping[str, Any]
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
@@ -24,23 +24,23 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
     faults: dict[KeyPath, str] = {}
     all_found = error.errors(include_url=False)
     real = _keys_of_real(all_found, tree.data, schema)
-    for found in all_found:
-        missing = found["type"] == "missing" and isinstance(found["loc"][-1], str)  # not a missing item of a list
-        path = _path(found["loc"], tree.data, missing)
-        if found["type"].startswith("union_tag"):
-            path = (*path, found["ctx"]["discriminator"].strip("'"))
-            missing = found["type"] == "union_tag_not_found"
+    for finding in all_found:
+        missing = finding["type"] == "missing" and isinstance(finding["loc"][-1], str)  # not a missing item of a list
+        path = _path(finding["loc"], tree.data, missing)
+        if finding["type"].startswith("union_tag"):
+            path = (*path, finding["ctx"]["discriminator"].strip("'"))
+            missing = finding["type"] == "union_tag_not_found"
         if path and path[-1] in (keys := real.get(path[:-1], [])):
             if path[-1] == keys[0]:
-                faults[path] = f"{tree.origin(path)}: {_keys_said(path[:-1], keys, tree.data)}"
+                faults[path] = f"{tree.origin(path)}: {_keys_sentence(path[:-1], keys, tree.data)}"
             continue
-        sentence = _sentence("missing" if missing else found["type"], path, found["msg"], tree.data, schema)
-        place = tree.origin((*path, *_key_named(found["type"], found["msg"])))
+        sentence = _sentence("missing" if missing else finding["type"], path, finding["msg"], tree.data, schema)
+        place = tree.origin((*path, *_key_named(finding["type"], finding["msg"])))
         faults.setdefault(path, f"{place}: {sentence}")
     # A list with a wrong item may also seem too short.
     lists = {path for path in faults if isinstance(_value(tree.data, path), list)}
     items = {path[:-1] for path in faults if path}
-    return [said for path, said in faults.items() if path not in lists & items]
+    return [text for path, text in faults.items() if path not in lists & items]
 
 
 def _keys_of_real(found: Sequence[Any], data: Any, schema: Schema) -> dict[KeyPath, list[str]]:
@@ -57,7 +57,7 @@ def _keys_of_real(found: Sequence[Any], data: Any, schema: Schema) -> dict[KeyPa
     return keys
 
 
-def _keys_said(group: KeyPath, keys: Sequence[str], data: Any) -> str:
+def _keys_sentence(group: KeyPath, keys: Sequence[str], data: Any) -> str:
     name, kind = ".".join(map(str, group)), _value(data, group)["kind"]
     return (
         f"{name}: {', '.join(keys)} belong{'s' if len(keys) == 1 else ''} to a real device, and its kind is {kind}; "
@@ -92,8 +92,8 @@ def _key_named(kind: str, message: str) -> KeyPath:
 def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema) -> str:
     name = ".".join(map(str, path)) or "the configuration"
     if kind == "value_error":
-        said = message.removeprefix(_OF_VALIDATOR)
-        return f"{name}: {said}" if path else said
+        sentence = message.removeprefix(_OF_VALIDATOR)
+        return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden":
         keys = [key for branch in _at(schema, path[:-1], data) for key in branch.get("properties", {})]
         return f"{name} is not a known key{_nearest(path[-1], keys)}; legal keys there: {', '.join(keys)}"
@@ -108,8 +108,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
 
 
 def _nearest(word: Any, legal: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(word), legal, n=1, cutoff=0.65)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return f" (did you mean {near}?)" if (near := nearest(word, legal)) else ""
 
 
 def _value(data: Any, path: KeyPath) -> Any:

@@ -94,7 +94,7 @@ def at_energies(config: Config) -> tuple[Config, ...]:
     scan, energies = config.scan, config.scan.energies
     if energies is None:
         return (config,)
-    found = []
+    configs = []
     for n, energy in enumerate(energies):
         words = ["scan.energies=null", override_of("scan.energy", energy)]
         if isinstance(scan.angles, RandomAngles):
@@ -102,8 +102,8 @@ def at_energies(config: Config) -> tuple[Config, ...]:
         elif isinstance(scan.angles, FixedAngles | InterlacedAngles | GoldenAngles):
             step = scan.angles.span_deg / scan.angles.views
             words.append(override_of("scan.angles.start_deg", scan.angles.start_deg + n / len(energies) * step))
-        found.append(changed(config, words))
-    return tuple(found)
+        configs.append(changed(config, words))
+    return tuple(configs)
 
 
 def override_of(key: str, value: object) -> str:
@@ -222,11 +222,11 @@ def _locate(data: Any, folder: Path) -> None:
     if (scan := _group(data, "scan", "angles", "path")) is not None:
         scan["path"] = str((folder / scan["path"]).resolve())
     if (simulation := _group(data, "simulation", "scene")) is not None:
-        found, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
-        if found.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
-            simulation["scene"] = found.relative_to(shipped).as_posix()
-        elif found.is_file():  # otherwise it counts as a shipped one
-            simulation["scene"] = str(found)
+        scene_file, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
+        if scene_file.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
+            simulation["scene"] = scene_file.relative_to(shipped).as_posix()
+        elif scene_file.is_file():  # otherwise it counts as a shipped one
+            simulation["scene"] = str(scene_file)
     for key in ("file", "labels"):  # file of a volume in a scene inside the configuration
         if (phantom := _group(data, "simulation", "scene", "phantom", key)) is not None:
             phantom[key] = str((folder / phantom[key]).resolve())

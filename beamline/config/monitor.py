@@ -14,15 +14,15 @@ from pydantic import AfterValidator, Field
 
 from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
-from beamline.monitor.checks import CHECKS
+from beamline.monitor.checks import BY_NAME, CHECKS
 from beamline.monitor.references import ReferenceLimits
+from splatline.registry import unknown
 
 
 def _names(retake: bool | tuple[str, ...]) -> bool | tuple[str, ...]:
     """ValueError for what is no check."""
-    known = [check.name for check in CHECKS]
-    if not isinstance(retake, bool) and (wrong := [name for name in retake if name not in known]):
-        raise ValueError(f"{', '.join(wrong)}: no such check; expected true, false or a list of {', '.join(known)}")
+    if not isinstance(retake, bool) and (wrong := [name for name in retake if name not in BY_NAME]):
+        raise ValueError(f"{unknown('check', wrong[0], BY_NAME)}; expected a list of these, true or false")
     return retake
 
 

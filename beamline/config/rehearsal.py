@@ -100,11 +100,13 @@ def _filter(real: DeviceSection) -> dict[str, Any]:
 
 
 def _monochromator(real: DeviceSection) -> dict[str, Any]:
-    found = real.monochromator
-    if isinstance(found, NoMonochromator):
-        return _plain(found)
-    settle = getattr(found, "settle_s", None)
-    return {"kind": "simulated", "range_kev": found.range_kev} | ({} if settle is None else {"settle_s": settle})
+    monochromator = real.monochromator
+    if isinstance(monochromator, NoMonochromator):
+        return _plain(monochromator)
+    settle = getattr(monochromator, "settle_s", None)
+    return {"kind": "simulated", "range_kev": monochromator.range_kev} | (
+        {} if settle is None else {"settle_s": settle}
+    )
 
 
 def _beam_monitor(real: DeviceSection) -> dict[str, Any]:

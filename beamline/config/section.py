@@ -47,9 +47,9 @@ def read_from(section: Section, settings: type[Any]) -> Any:
 
 
 def _key(field: FlatField) -> Key:
-    found = field.metadata["key"]
-    assert isinstance(found, Key)
-    return found
+    declared_key = field.metadata["key"]
+    assert isinstance(declared_key, Key)
+    return declared_key
 
 
 def _name(field: FlatField) -> str:

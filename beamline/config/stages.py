@@ -47,9 +47,9 @@ class FoundOnDisk:
 
     def load(self) -> Mapping[str, str]:
         with suppress(OSError, ValueError):  # none, or not whole
-            found = json.loads(self._path.read_text(encoding="utf-8"))
-            if isinstance(found, dict):
-                return {str(name): str(value) for name, value in found.items()}
+            kept_settings = json.loads(self._path.read_text(encoding="utf-8"))
+            if isinstance(kept_settings, dict):
+                return {str(name): str(value) for name, value in kept_settings.items()}
         return {}
 
     def save(self, found: Mapping[str, str]) -> None:

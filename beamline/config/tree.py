@@ -125,7 +125,7 @@ def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str
     for keys, text, origin in changes:
         _put(data, keys, _parsed(text, origin)[0])
         path = tuple(keys)
-        origins = {known: said for known, said in origins.items() if known[: len(path)] != path} | {path: origin}
+        origins = {known: where for known, where in origins.items() if known[: len(path)] != path} | {path: origin}
     return Tree(data, origins)
 
 

@@ -82,7 +82,7 @@ def exit_code(error: BaseException) -> int:
     return BeamlineError.exit_code
 
 
-def memory_limit_said() -> str:
+def memory_limit_sentence() -> str:
     """A sentence, after a space, on the addresses that this process may take; "" without a limit."""
     from beamline.core.machine import memory_limit  # here, because most messages need none of it
 
@@ -116,8 +116,8 @@ def out_of_memory(error: BaseException | None) -> bool:
 
 def damaged(error: BaseException) -> bool:
     """Whether HDF5 could not read or follow the content of a file; h5py has no error class for this."""
-    said = str(error)
-    return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in said and "exist" not in said
+    message = str(error)
+    return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in message and "exist" not in message
 
 
 def is_defect(error: BaseException) -> bool:
@@ -130,14 +130,18 @@ def user_message(error: BaseException) -> str:
     if out_of_memory(error):
         what = " ".join(str(error).split()) or "no details"
         return (
-            f"Out of memory ({what}).{memory_limit_said()} No half result was kept, and what was there is untouched. "
-            "Take fewer --rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
+            f"Out of memory ({what}).{memory_limit_sentence()} No half result was kept, and what was there is "
+            "untouched. Take fewer --rows or --views, a coarser --bin, or a smaller --memory, which works in slabs."
         )
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"{error.filename}: "
         return f"{where}{error.strerror}. Check the path, the permissions and the disk."
     if damaged(error):
-        limit = f"{said} If that is too little, the file may be good." if (said := memory_limit_said()) else ""
+        limit = (
+            f"{memory_limit} If that is too little, the file may be good."
+            if (memory_limit := memory_limit_sentence())
+            else ""
+        )
         return (
             f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original.{limit}"
         )

@@ -300,6 +300,14 @@ class SnapshotWritten(Event, event="snapshot"):
     unlearnt: float | None
 
 
+class SlicesDrawn(Event, event="slices"):
+    """Slices by FBP of the views so far are in the picture. degrees: of the half turn, that the views cover."""
+
+    picture: Path
+    n_views: int
+    degrees: float
+
+
 class EnoughReached(Event, event="enough"):
     """The views so far are enough: the others would add `mean` dB, between `low` and `high`."""
 

@@ -44,8 +44,8 @@ def create_part(run: Path) -> Path:
 
 
 def _numbered(run: Path) -> dict[int, Path]:
-    found = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*")) if not leads_away(part)}
-    return {int(number): part for number, part in found.items() if number.isdecimal()}
+    parts = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*")) if not leads_away(part)}
+    return {int(number): part for number, part in parts.items() if number.isdecimal()}
 
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems and file systems without this call
@@ -65,23 +65,23 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
     Opening a pipe may wait for ever, and a device may never end.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         return
-    if not stat.S_ISREG(found.st_mode):
-        what = "It is a folder" if stat.S_ISDIR(found.st_mode) else "It is a device or a pipe"
+    if not stat.S_ISREG(status.st_mode):
+        what = "It is a folder" if stat.S_ISDIR(status.st_mode) else "It is a device or a pipe"
         raise OSError(errno.EINVAL, f"{what}, and a regular file is expected", str(path))
-    if found.st_size > largest:
-        raise OSError(errno.EFBIG, f"It has {found.st_size} bytes, and at most {largest:.0f} are read", str(path))
+    if status.st_size > largest:
+        raise OSError(errno.EFBIG, f"It has {status.st_size} bytes, and at most {largest:.0f} are read", str(path))
 
 
 def leads_away(path: Path) -> bool:
     """Whether a path is a link, or a junction of Windows, to another place."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return False
-    return stat.S_ISLNK(found.st_mode) or getattr(found, "st_reparse_tag", 0) == _JUNCTION
+    return stat.S_ISLNK(status.st_mode) or getattr(status, "st_reparse_tag", 0) == _JUNCTION
 
 
 def same_file(first: os.stat_result, second: os.stat_result) -> bool:

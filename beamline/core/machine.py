@@ -116,7 +116,7 @@ def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
         lines = own.read_text(encoding="utf-8", errors="replace").splitlines()
     for pattern, tree, most, now, cache in (_CGROUP_2, _CGROUP_1):
         top = root / tree
-        folder = top / next((found[1] for line in lines if (found := re.fullmatch(pattern, line))), "")
+        folder = top / next((match[1] for line in lines if (match := re.fullmatch(pattern, line))), "")
         for place in (folder, *folder.parents):
             if not place.is_relative_to(top):
                 break

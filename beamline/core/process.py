@@ -264,7 +264,7 @@ def last_line(log: Path, start: int = 0) -> str:
 def json_object(line: str) -> dict[str, Any] | None:
     """The JSON object in a line of output; None for any other line, such as the output of a library."""
     try:
-        found = json.loads(line)
+        value = json.loads(line)
     except (ValueError, RecursionError):  # RecursionError: nested deeper than Python's stack
         return None
-    return found if isinstance(found, dict) else None
+    return value if isinstance(value, dict) else None

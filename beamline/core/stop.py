@@ -131,26 +131,6 @@ def never_stopped() -> Iterator[Callable[[], bool]]:
     yield lambda: False
 
 
-class StopLatch:
-    """Calls `stop_requested` until it returns True, and stays True from then on.
-
-    Attributes:
-        stopped: a call has returned True.
-    """
-
-    def __init__(self, stop_requested: Callable[[], bool]) -> None:
-        self._stop_requested = stop_requested
-        self.stopped = False
-
-    def __call__(self) -> bool:
-        self.stopped = self.stopped or self._stop_requested()
-        return self.stopped
-
-    def cut(self, done: int, planned: int) -> bool:
-        """Whether the stop left some of the `planned` steps or iterations undone; 0: without a planned number."""
-        return self.stopped and not 0 < planned <= done
-
-
 class ScanAborted(ScanStopped):
     """Aborted, or interrupted before the first frame; the frames acquired so far are in the file."""
 

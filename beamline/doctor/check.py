@@ -39,5 +39,5 @@ class Diagnosis:
 def of_error(name: str, error: DeviceError, expected: str, verdict: Grade = Grade.FAILED) -> Diagnosis:
     """The check that failed with an error of a device."""
     reply = f" It answered {error.reply!r}." if error.reply else ""
-    found = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
-    return Diagnosis(name, verdict, found, error.expected or expected, error.advice)
+    observed = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
+    return Diagnosis(name, verdict, observed, error.expected or expected, error.advice)

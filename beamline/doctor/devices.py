@@ -58,21 +58,21 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Diagnosis:
         return Diagnosis(name, Grade.CANNOT_CHECK, f"{url} can only be tried by opening it.")
     listed = "; ".join(map(str, found)) or "no serial ports"
     known = next((one for one in found if _same(one.device, url)), None)
-    said = partial(Diagnosis, name, values={"port": url, "ports": [vars(one) for one in found]})
+    diagnosis = partial(Diagnosis, name, values={"port": url, "ports": [vars(one) for one in found]})
     expected = f"the port {url} of the configuration"
     if known is None and (sys.platform == "win32" or not Path(url).exists()):
         advice = (
             "Plug the adapter in, switch the controller on, and set the port to one of those found. A name under "
             "/dev/serial/by-id stays the same when adapters are plugged in another order"
         )
-        return said(Grade.FAILED, f"There is no port {url}; there are {listed}.", expected, advice)
+        return diagnosis(Grade.FAILED, f"There is no port {url}; there are {listed}.", expected, advice)
     if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
         expected = f"permission to read and write {url}"
         advice = (
             "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again"
         )
-        return said(Grade.FAILED, f"{known or url} may not be opened by this user.", expected, advice)
-    return said(Grade.OK, f"{known or url}.", expected)
+        return diagnosis(Grade.FAILED, f"{known or url} may not be opened by this user.", expected, advice)
+    return diagnosis(Grade.OK, f"{known or url}.", expected)
 
 
 def _same(device: str, url: str) -> bool:
@@ -90,8 +90,8 @@ def _network(name: str, url: str) -> Diagnosis:
     except ValueError:
         host, number = "", None
     if not host or not number:
-        found, advice = f"{url} is not an address.", "Correct the configuration"
-        return Diagnosis(name, Grade.FAILED, found, "socket://host:port", advice)
+        observed, advice = f"{url} is not an address.", "Correct the configuration"
+        return Diagnosis(name, Grade.FAILED, observed, "socket://host:port", advice)
     try:
         socket.create_connection((host, number), CONNECT_TIMEOUT).close()
     except OSError as error:
@@ -138,13 +138,15 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Diagnosis:
             LINK, Grade.NOT_APPLICABLE, "A CoaXPress camera is on its frame grabber, not on USB.", _SUPERSPEED
         )
     product, serial = (None, None) if camera is None else (camera.usb_product, camera.usb_serial)
-    found = usb.preflight(product=product, serial=serial, backend=backend)
-    verdict = _VERDICTS[found.verdict]
+    preflight = usb.preflight(product=product, serial=serial, backend=backend)
+    verdict = _VERDICTS[preflight.verdict]
     if verdict is Grade.FAILED and camera is None:
         verdict = Grade.WARNING
     otherwise = "" if verdict is Grade.OK else f"{_NO_LIBUSB}; the camera itself does not need it"
-    values = {"devices": [vars(device) for device in found.devices]}
-    return Diagnosis(LINK, verdict, found.message, _SUPERSPEED, _LINK_ADVICE.get(found.verdict, otherwise), values)
+    values = {"devices": [vars(device) for device in preflight.devices]}
+    return Diagnosis(
+        LINK, verdict, preflight.message, _SUPERSPEED, _LINK_ADVICE.get(preflight.verdict, otherwise), values
+    )
 
 
 def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
@@ -162,22 +164,22 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
     file = _loaded_file(path)
     version = version_of(file)
     values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
-    found = f"{file or path or 'the installed library'}, version {version or 'not known'}."
+    observed = f"{file or path or 'the installed library'}, version {version or 'not known'}."
     if not session:
-        return Diagnosis(LIBRARY, Grade.OK, found, expected, values=values)
+        return Diagnosis(LIBRARY, Grade.OK, observed, expected, values=values)
     index = 0 if camera is None else camera.index
     try:
         cameras = _cameras(loaded)
     except DeviceError as error:
         failure = of_error(LIBRARY, error, f"{expected}, and a camera")
-        return replace(failure, found=f"{found} {failure.found}", values=values)
+        return replace(failure, found=f"{observed} {failure.found}", values=values)
     values["cameras"] = cameras
     listed = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
     if index >= len(cameras):
-        found, expected = f"{found} {len(cameras)} cameras: {listed}.", f"a camera of index {index}"
+        observed, expected = f"{observed} {len(cameras)} cameras: {listed}.", f"a camera of index {index}"
         advice = "Set devices.camera.index to one of these cameras"
-        return Diagnosis(LIBRARY, Grade.FAILED, found, expected, advice, values)
-    return Diagnosis(LIBRARY, Grade.OK, f"{found} {listed}.", expected, values=values)
+        return Diagnosis(LIBRARY, Grade.FAILED, observed, expected, advice, values)
+    return Diagnosis(LIBRARY, Grade.OK, f"{observed} {listed}.", expected, values=values)
 
 
 def version_of(file: Path | None) -> str:

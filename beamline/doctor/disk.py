@@ -118,43 +118,43 @@ def measure(
 def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = temporary) -> Diagnosis:
     """Write speed of the disk that holds `folder`, or will hold it, against the rate of the frames."""
     expected = "" if needs is None else f"{size(needs.rate)}/s, with previews, at the highest frame rate"
-    there, said = disk_of(folder), partial(Diagnosis, SPEED, expected=expected)
+    there, diagnosis = disk_of(folder), partial(Diagnosis, SPEED, expected=expected)
     # The file is temporary, but must not fill the disk even for a moment.
     most = min(MOST, shutil.disk_usage(there).free // 4)
     if most < LEAST:
-        return said(Grade.CANNOT_CHECK, f"{there} has too little free space for a measurement.")
+        return diagnosis(Grade.CANNOT_CHECK, f"{there} has too little free space for a measurement.")
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
         if error.errno == errno.EINVAL:  # a file system without fsync
-            return said(Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.")
+            return diagnosis(Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.")
         expected = expected or "a folder in which files can be created"
         advice = "Choose another storage.folder, or correct its permissions or its disk"
-        found = f"{there} cannot be written to ({error.strerror or error})."
-        return Diagnosis(SPEED, Grade.FAILED, found, expected, advice)
+        observed = f"{there} cannot be written to ({error.strerror or error})."
+        return Diagnosis(SPEED, Grade.FAILED, observed, expected, advice)
     rate = measured.rate
-    found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, synchronised)."
+    observed = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, synchronised)."
     values = {"bytes_per_s": rate, "written": measured.n_bytes, "seconds": measured.seconds}
     if needs is None:
-        return said(Grade.OK, found, values=values)
+        return diagnosis(Grade.OK, observed, values=values)
     backlog, there_is_room = needs.backlog(rate), f"in memory, which has room for {size(needs.waiting_bytes)}."
     values |= {"needed_bytes_per_s": needs.rate, "backlog": backlog, "waiting_bytes": needs.waiting_bytes}
     if rate >= COMFORT * needs.rate:
-        return said(Grade.OK, found, values=values)
+        return diagnosis(Grade.OK, observed, values=values)
     if backlog <= needs.waiting_bytes / 2:
-        found += f" At most {size(backlog)} will wait {there_is_room}"
+        observed += f" At most {size(backlog)} will wait {there_is_room}"
         advice = "Let no other program write to this disk during the scan, or choose a faster disk"
-        return said(Grade.WARNING, found, advice=advice, values=values)
-    found += f" {size(backlog)} would have to wait {there_is_room}"
+        return diagnosis(Grade.WARNING, observed, advice=advice, values=values)
+    observed += f" {size(backlog)} would have to wait {there_is_room}"
     advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
-    return said(Grade.FAILED, found, advice=advice, values=values)
+    return diagnosis(Grade.FAILED, observed, advice=advice, values=values)
 
 
 def locks(folder: Path) -> Diagnosis:
     """Whether files can be locked where the scan's file will be, as HDF5 wants."""
     there = disk_of(folder)
-    if said := no_locks(there):
-        cause, _, advice = said.partition("; ")
+    if no_locking := no_locks(there):
+        cause, _, advice = no_locking.partition("; ")
         return Diagnosis(LOCKS, Grade.FAILED, f"{cause[0].upper()}{cause[1:]}.", "a disk with file locks", advice)
     return Diagnosis(LOCKS, Grade.OK, f"Files in {there} can be locked.")
 
@@ -162,14 +162,14 @@ def locks(folder: Path) -> Diagnosis:
 def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
     """Free space against the size of the file."""
     free = shutil.disk_usage(disk_of(folder)).free
-    found, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
+    observed, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
     if needs is None:
-        return Diagnosis(ROOM, Grade.OK, found, values=values)
+        return Diagnosis(ROOM, Grade.OK, observed, values=values)
     values["needed_bytes"] = needs.file_bytes
     expected = f"{size(needs.file_bytes)} for the scan and a tenth more; as much again for its reconstruction"
     if free < needs.file_bytes:
         advice = "Free some space, choose another storage.folder, or reduce views, roi or binning"
-        return Diagnosis(ROOM, Grade.FAILED, found, expected, advice, values)
+        return Diagnosis(ROOM, Grade.FAILED, observed, expected, advice, values)
     if free < 2 * needs.file_bytes:
-        return Diagnosis(ROOM, Grade.WARNING, found, expected, "Free some space before the next scan", values)
-    return Diagnosis(ROOM, Grade.OK, found, expected, values=values)
+        return Diagnosis(ROOM, Grade.WARNING, observed, expected, "Free some space before the next scan", values)
+    return Diagnosis(ROOM, Grade.OK, observed, expected, values=values)

@@ -51,13 +51,13 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     else:
         for name in (devices.LINK, devices.LIBRARY):
             yield Diagnosis(name, Grade.NOT_APPLICABLE, "The camera is simulated.")
-    found = serial_ports()
+    port_list = serial_ports()
     if config is None:
-        yield ports(found)
+        yield ports(port_list)
     else:
-        yield port("stage port", config.devices.stage.port, found)
-        yield from _monitor(config.devices.beam_monitor, found, clock)
-        yield from _filter(config.devices.filter, found, clock)
+        yield port("stage port", config.devices.stage.port, port_list)
+        yield from _monitor(config.devices.beam_monitor, port_list, clock)
+        yield from _filter(config.devices.filter, port_list, clock)
         yield from _monochromator(config.devices.monochromator, clock)
     folder = Path((StorageSection() if config is None else config.storage).folder)
     yield disk.room(folder, need)
@@ -70,7 +70,7 @@ def frame_rate(worked: DryRun) -> Diagnosis:
     """Frames/s and bytes/s of the scan's blocks against what camera and link give."""
     frame, most = worked.timeline.frame_bytes, 1 / worked.camera.min_period
 
-    def said(rate: float) -> str:
+    def in_hertz(rate: float) -> str:
         return f"{rate:.3g} frames/s = {size(rate * frame)}/s"
 
     rates = {
@@ -78,12 +78,12 @@ def frame_rate(worked: DryRun) -> Diagnosis:
         for block in worked.timeline.blocks
     }
     fastest = max(rates.values())
-    found = "; ".join(f"{name} {said(rate)}" for name, rate in rates.items()) + f", frames of {size(frame)}."
-    expected = f"at most {said(most)}, which camera and link give"
+    observed = "; ".join(f"{name} {in_hertz(rate)}" for name, rate in rates.items()) + f", frames of {size(frame)}."
+    expected = f"at most {in_hertz(most)}, which camera and link give"
     values = {"frames_per_s": fastest, "bytes_per_s": fastest * frame, "most_frames_per_s": most}
     if fastest <= most * (1 + 1e-9):
-        return Diagnosis(_RATE, Grade.OK, found, expected, values=values)
-    return Diagnosis(_RATE, Grade.FAILED, found, expected, "`beamline check` says which limits it breaks", values)
+        return Diagnosis(_RATE, Grade.OK, observed, expected, values=values)
+    return Diagnosis(_RATE, Grade.FAILED, observed, expected, "`beamline check` says which limits it breaks", values)
 
 
 def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
@@ -157,8 +157,10 @@ def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:
         values |= {"needed_bytes": needs.memory, "ring_bytes": needs.ring_bytes}
     if free is None:
         return Diagnosis(_MEMORY, Grade.CANNOT_CHECK, "This system does not report its free memory.", expected)
-    found = f"{size(free)} free."
+    observed = f"{size(free)} free."
     if needs is None or free >= 2 * needs.memory:
-        return Diagnosis(_MEMORY, Grade.OK, found, expected, values=values)
+        return Diagnosis(_MEMORY, Grade.OK, observed, expected, values=values)
     advice = "Close other programs, or choose a smaller roi or binning"
-    return Diagnosis(_MEMORY, Grade.WARNING if free >= needs.memory else Grade.FAILED, found, expected, advice, values)
+    return Diagnosis(
+        _MEMORY, Grade.WARNING if free >= needs.memory else Grade.FAILED, observed, expected, advice, values
+    )

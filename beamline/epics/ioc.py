@@ -174,9 +174,9 @@ def _frame(now: RunValues, event: Mapping[str, Any]) -> dict[str, Any]:
 def _flag(now: RunValues, event: Mapping[str, Any]) -> dict[str, Any]:
     if "check" not in event:  # a rule of the file
         return {}
-    said = {"last_flag": f"{event['check']} {event['level']}, frame {event['frame']}: {event['advice']}"}
+    newest_flag = {"last_flag": f"{event['check']} {event['level']}, frame {event['frame']}: {event['advice']}"}
     counted = {"alarm": {"alarms": now.alarms + 1}, "warn": {"warnings": now.warnings + 1}}
-    return {**said, **counted.get(event["level"], {})}
+    return {**newest_flag, **counted.get(event["level"], {})}
 
 
 _TAKEN = {

@@ -274,18 +274,18 @@ def _instrument(
 def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
     wanted = config.devices.filter
     if isinstance(wanted, MotorFilter | EpicsFilter):
-        found = wanted.connect(clock)
-        opened.callback(found.close)
-        return found
+        connected = wanted.connect(clock)
+        opened.callback(connected.close)
+        return connected
     return None if isinstance(wanted, NoFilter) else ManualFilter(ask)
 
 
 def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
     wanted = config.devices.monochromator
     if isinstance(wanted, EpicsMonochromator):
-        found = wanted.connect(clock)
-        opened.callback(found.close)
-        return found
+        connected = wanted.connect(clock)
+        opened.callback(connected.close)
+        return connected
     return None if isinstance(wanted, NoMonochromator) else ManualMonochromator(ask)
 
 

@@ -133,9 +133,9 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     from simulators.frame.mapping import SceneError
     from simulators.scenes.scene import load_scene
 
-    said = config.simulation.scene if config.simulation else {}
+    stated_scene = config.simulation.scene if config.simulation else {}
     # Paths in a scene that stands in the configuration itself are full ones by now.
-    folder = config_folder() if isinstance(said, dict) else (config_folder() / said).parent
+    folder = config_folder() if isinstance(stated_scene, dict) else (config_folder() / stated_scene).parent
     mapping = scene_mapping(config)
     if energy is not None and isinstance(beam := mapping.get("beam"), dict):
         if wide := [name for name in ("spectrum", "tube") if beam.get(name) is not None]:

@@ -36,7 +36,7 @@ class Aside:
             self.wider + (context.truncated and context.grid.flats),
         )
 
-    def said(self) -> tuple[str, ...]:
+    def in_words(self) -> tuple[str, ...]:
         """Checks, views and reason, a text each. First views, which have no earlier ones, count only if all do."""
         alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
         reasons = (

@@ -152,8 +152,8 @@ class BandsCheck:
             first, after, darker = profile.first, profile.after, profile.jump < 0
             excess = _contrast(lines, first, after, darker) - _contrast(profile.last[-1], first, after, darker)
             if excess > REMAINS * abs(profile.jump) and profile.flagged < PATIENCE:
-                found = first, after, -math.expm1(-excess if darker else excess), self.alarm
-                return replace(profile, flagged=profile.flagged + 1), found
+                band = first, after, -math.expm1(-excess if darker else excess), self.alarm
+                return replace(profile, flagged=profile.flagged + 1), band
             return Profile((lines,), profile.change, profile.seen, blocks), None
         steps = len(profile.last) - 1
         velocity = (profile.last[-1] - profile.last[0]) / steps if steps else np.zeros_like(lines)
@@ -171,8 +171,8 @@ class BandsCheck:
                 1.0, jump
             )
             if now > STANDS_OUT * abs(jump) and min(now - before, along) > REMAINS * abs(jump):
-                found = first, after, -math.expm1(jump), -math.expm1(-float(limit[worst]))
-                return replace(profile, first=first, after=after, jump=jump, flagged=1), found
+                band = first, after, -math.expm1(jump), -math.expm1(-float(limit[worst]))
+                return replace(profile, first=first, after=after, jump=jump, flagged=1), band
         weight = max(MEMORY, 1 / (profile.seen + 1))
         usual = profile.change + weight * (np.abs(change) - profile.change)
         return Profile((*profile.last, lines)[-1 - BEFORE :], usual, profile.seen + 1, blocks), None

@@ -47,7 +47,7 @@ class BlurState:
     down: FrameScatter = field(default_factory=FrameScatter)
     first: tuple[FrameScatter, FrameScatter] | None = None  # the same of the first views, which stay
     blurred: int = 0  # views in a row that are flagged
-    said: bool = False  # the slow loss was reported
+    reported: bool = False  # the slow loss was reported
 
 
 @dataclass(frozen=True)
@@ -104,13 +104,13 @@ class BlurCheck:
         assert state.first is not None
         losses = [_loss(now.mean, first) for now, first in zip((state.across, state.down), state.first, strict=True)]
         limit = max(self._limit(first) for first in state.first)
-        if state.said or limit >= LEAST or min(losses) <= limit:
+        if state.reported or limit >= LEAST or min(losses) <= limit:
             return Look(state)
         advice = (
             f"The finest detail has {min(losses):.0%} less contrast than in the first views: the focus drifts, or the "
             "sample shows its sharp edges no more from here. Compare with the view half a turn away."
         )
-        return Look(replace(state, said=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
+        return Look(replace(state, reported=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:

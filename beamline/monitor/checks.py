@@ -11,7 +11,7 @@ from dataclasses import fields
 from importlib import import_module
 
 from beamline.monitor.check import Check, Flag, Level
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
 BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one first
@@ -49,8 +49,8 @@ def _distinct(*checks: Check) -> tuple[Check, ...]:
     return checks
 
 
-def _plugged(ours: tuple[Check, ...]) -> tuple[Check, ...]:
-    """Those of other packages."""
+def _all(ours: tuple[Check, ...]) -> Registry[Check]:
+    """With those of other packages."""
     found = ours
 
     def made(name: str, kind: Callable[[], Check]) -> Check:
@@ -62,11 +62,12 @@ def _plugged(ours: tuple[Check, ...]) -> tuple[Check, ...]:
         found = _distinct(*found, check)
         return check
 
-    return tuple(plugins("check", {check.name for check in ours}, made).values())
+    return Registry("check", {check.name: check for check in ours}, made)
 
 
 _OURS = _distinct(*(getattr(import_module(f"beamline.monitor.{module}"), name)() for module, name in REGISTRY.items()))
-CHECKS: tuple[Check, ...] = (*_OURS, *_plugged(_OURS))
+BY_NAME = _all(_OURS)
+CHECKS: tuple[Check, ...] = tuple(BY_NAME.values())
 """All checks with their default limits, in the order in which they look at a frame."""
 
 _BITS = {check.name: check.bit for check in CHECKS}
@@ -80,7 +81,7 @@ def flagged_frames(flags: Iterable[Flag]) -> dict[tuple[str, Level], set[int]]:
     for check, level in frames:
         if level is Level.WARN:
             frames[check, level] -= frames.get((check, Level.ALARM), set())
-    return {key: found for key, found in frames.items() if found}
+    return {key: rows for key, rows in frames.items() if rows}
 
 
 def bitmask(flags: Iterable[Flag]) -> int:

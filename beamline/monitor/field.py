@@ -28,7 +28,7 @@ class FieldState:
 
     unlit: bool = False
     cut: int = 0
-    said: bool = False
+    reported: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class FieldOfViewCheck:
                 return Look(state)
             flag = self._unlit(frame, digest.preview - context.dark)
             return Look(replace(state, unlit=flag is not None), flag)
-        if context.view is None or context.grid is None or not context.grid.flats or state.said:
+        if context.view is None or context.grid is None or not context.grid.flats or state.reported:
             return Look(state)
         edges = at_edges(context)
         cut = state.cut + 1 if max(edges) > self.edge else 0
         if cut < LASTS:
             return Look(replace(state, cut=cut))
-        return Look(replace(state, said=True), self._cut(frame.index, edges, context.grid))
+        return Look(replace(state, reported=True), self._cut(frame.index, edges, context.grid))
 
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))

@@ -182,7 +182,7 @@ def with_sample(
     means = [np.mean(group, axis=0) for group in light]
     bright = [float(np.percentile(mean, BRIGHT)) for mean in means]
     shining = None if single or len(flats) < 2 else _outshining(flats, darks, views)
-    found = []
+    displaced = []
     for at, group in enumerate(flats):
         if not bright[at] > UNLIT * max(bright):
             continue  # without light, which is another fault
@@ -212,10 +212,10 @@ def with_sample(
                     "sample was in the beam."
                 )
                 frames = [group[i]] if single else group
-                found += [
+                displaced += [
                     OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, sentence) for frame in frames
                 ]
-    return found
+    return displaced
 
 
 @dataclass(frozen=True, eq=False)

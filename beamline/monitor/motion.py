@@ -91,12 +91,12 @@ class MotionCheck:
     def _jump(self, state: MotionState, after: MotionState, row: int, change: SampleChange) -> Look[MotionState] | None:
         """A jump or a slip; None where there is none."""
         usual = state.across, state.down, state.turn
-        found = change.across, change.down, change.turn
+        change_of_place = change.across, change.down, change.turn
         limits = self.alarm, self.alarm, self.steps
         limit_across, limit_down, limit_turn = (
             max(least, SIGMAS * s.sigma) for least, s in zip(limits, usual, strict=True)
         )
-        across, down, turn = (x - s.mean for x, s in zip(found, usual, strict=True))
+        across, down, turn = (x - s.mean for x, s in zip(change_of_place, usual, strict=True))
         over = abs(across) > limit_across or abs(down) > limit_down or abs(turn) > limit_turn
         if over and (beside := change.beside_columns()) is not None:
             right, below, further = (x - s.mean for x, s in zip(beside, usual, strict=True))

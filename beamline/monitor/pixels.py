@@ -34,15 +34,16 @@ class PixelsState:
 
     dead: PixelPlaces | None = None
     in_flats: bool = False
-    said: bool = False
+    reported: bool = False
     holes: float = 0.0
 
 
 @dataclass(frozen=True)
 class PixelsCheck:
     """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
-    of the light around them. It is said at the first view, as a fact where they are few. In a view also the fraction
-    that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where none does.
+    of the light around them. It is reported at the first view, as a fact where they are few. In a view also the
+    fraction that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where
+    none does.
 
     The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
     """
@@ -65,7 +66,7 @@ class PixelsCheck:
             state = replace(state, holes=max(state.holes, holes))
         elif holes - state.holes > HOLES:
             return Look(state, self._without_number(frame.index, holes - state.holes))
-        if state.said:
+        if state.reported:
             return Look(state)
         if frame.kind is FrameKind.FLAT:
             dead = _dead(frame, digest, context)
@@ -75,7 +76,7 @@ class PixelsCheck:
         state = replace(state, in_flats=False)
         if frame.kind is not FrameKind.PROJECTION or state.dead is None:
             return Look(state)
-        return Look(replace(state, said=True), self._flag(frame, state.dead) if state.dead.size else None)
+        return Look(replace(state, reported=True), self._flag(frame, state.dead) if state.dead.size else None)
 
     def _without_number(self, row: int, score: float) -> Flag:
         advice = (

@@ -161,7 +161,7 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
     flats = [group for group in numbers if group[0].kind is FrameKind.FLAT]
     known = [group for group in flats if _saturated(group, base, limits) is None] or flats
     bright = max(known, key=lambda group: _light(group, base), default=None)
-    found = []
+    judged = []
     for group in groups:
         if is_blank(group):
             faults: list[ReferenceFault | None] = [_BLANK]
@@ -174,8 +174,8 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
             if not any(faults):
                 faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
         rows = tuple(reference.row for reference in group)
-        found.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
-    return tuple(found)
+        judged.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
+    return tuple(judged)
 
 
 def is_blank(group: Group) -> bool:
@@ -218,11 +218,11 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
     score = float(np.median([flat.saturated for flat in flats])) - hot
     if score <= limits.saturated:
         return None
-    said = (
+    sentence = (
         f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
         "Shorten the exposure or add a filter."
     )
-    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, said)
+    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
 
 
 def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> ReferenceFault | None:
@@ -230,19 +230,21 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
         return None
     if not _has_light(flats, darks, limits):
         light, noise = _level(flats) - _level(darks), max(_noise(darks), darks[0].rounding)
-        said = (
+        sentence = (
             f"there is no beam in them: their level {_level(flats):.6g} is {light:.3g} above the darks' "
             f"{_level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
             "Was the shutter open for them, and closed for the darks?"
         )
-        return ReferenceFault(FaultKind.NO_BEAM, light / noise if noise else 0.0, limits.light_over_noise, said)
+        return ReferenceFault(FaultKind.NO_BEAM, light / noise if noise else 0.0, limits.light_over_noise, sentence)
     most = _light(bright, darks)
     gone = 1 - _light(flats, darks) / most
     if gone <= limits.light_gone:
         return None
     where = spans([reference.row for reference in bright])
-    said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.light_gone:.0%}): the beam was lost."
-    return ReferenceFault(FaultKind.BEAM_LOST, gone, limits.light_gone, said)
+    sentence = (
+        f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.light_gone:.0%}): the beam was lost."
+    )
+    return ReferenceFault(FaultKind.BEAM_LOST, gone, limits.light_gone, sentence)
 
 
 def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> ReferenceFault | None:
@@ -254,11 +256,11 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
     if there >= (1 - limits.light_gone) * most:
         return None
     share = there / most
-    said = (
+    sentence = (
         f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
         f"takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
-    return ReferenceFault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
+    return ReferenceFault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, sentence)
 
 
 def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
@@ -277,16 +279,16 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     level = float(np.ptp(levels))
     place = float(np.percentile(local, WORST, axis=1).max())
     if level > limits.uneven:
-        said = (
+        sentence = (
             f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
         )
-        return ReferenceFault(FaultKind.UNEVEN, level, limits.uneven, said)
+        return ReferenceFault(FaultKind.UNEVEN, level, limits.uneven, sentence)
     if place > max(limits.uneven, CHANGE_SIGMAS * noise):
-        said = (
+        sentence = (
             f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
             "moved in the beam. Is the sample out?"
         )
-        return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, said)
+        return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, sentence)
     return None
 
 
@@ -295,11 +297,11 @@ def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refere
     score = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean())
     if score <= limits.unlit:
         return None
-    said = (
+    sentence = (
         f"{score:.0%} of the frame has no light in them (limit {limits.unlit:.0%}): move beam and detector onto one "
         "another, or read fewer pixels."
     )
-    return ReferenceFault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, said)
+    return ReferenceFault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, sentence)
 
 
 def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> ReferenceFault | None:
@@ -315,12 +317,12 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Re
         return None
     if score <= limit or _level(darks) <= 0:
         return None
-    said = (
+    sentence = (
         f"there is light in them: their level {_level(darks):.6g} is {level:.0%} of the flats' {_level(flats):.6g}"
         + (f" and their variance {variance:.0%}" if known else "")
         + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
     )
-    return ReferenceFault(FaultKind.LIGHT_IN_DARKS, score, limit, said)
+    return ReferenceFault(FaultKind.LIGHT_IN_DARKS, score, limit, sentence)
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:

@@ -194,10 +194,10 @@ def tracks_of(octave: Octave, sample: SampleMotion, least: float) -> list[Track]
     _highest(newest, offsets, best)
     n = _seeds(newest, offsets, np.float32(PROMISING), best, seeds)
     highest = seeds[:n][np.argsort(-seeds[:n, 3])[:MOST_SEEDS]]
-    found = [
+    tracks = [
         _track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest
     ]
-    return sorted((track for track in found if track is not None), key=lambda track: -track.score)
+    return sorted((track for track in tracks if track is not None), key=lambda track: -track.score)
 
 
 def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMotion, least: float) -> Track | None:

@@ -211,7 +211,7 @@ class _Server:
         return StreamingResponse(self._feed(first), media_type="text/event-stream")
 
     async def _feed(self, first: int) -> AsyncIterator[str]:
-        said, ended = "", False
+        sent, ended = "", False
         while not ended:
             ended = self._access.ended.is_set()  # then what came last is still told
             state = await self._now(at_once=ended)
@@ -220,8 +220,8 @@ class _Server:
                 yield f"id: {number}\nevent: run\ndata: {lines[number]}\n\n"
             first = max(first, len(lines))
             now = json.dumps(state)
-            if now != said:
-                said = now
+            if now != sent:
+                sent = now
                 yield f"event: state\ndata: {now}\n\n"
             if not ended:
                 await asyncio.sleep(_PERIOD)
@@ -275,12 +275,12 @@ class _Server:
         """The answer that many ask for at the same time, made once: all are made in the reading thread."""
 
         def kept(file: Recording) -> Response:
-            found = key(file)
-            if found not in self._kept:
-                self._kept[found] = make(file)
+            identity = key(file)
+            if identity not in self._kept:
+                self._kept[identity] = make(file)
                 if len(self._kept) > _KEPT:
                     del self._kept[next(iter(self._kept))]
-            return self._kept[found]
+            return self._kept[identity]
 
         return self._reader.do(kept)
 

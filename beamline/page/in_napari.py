@@ -33,12 +33,12 @@ def show(volumes: Sequence[Path], labels: Path | None) -> None:
         ) from error
     with ExitStack() as opened:
         records = [opened.enter_context(opened_volume(path)) for path in volumes]
-        found = None if labels is None else _labels(labels, records[0])
+        label_layer = None if labels is None else _labels(labels, records[0])
         viewer = napari.Viewer(title=", ".join(path.name for path in volumes))
         for path, record in zip(volumes, records, strict=True):
             viewer.add_image(_values(record), name=path.name, **_place(record))
-        if found is not None:
-            viewer.add_labels(found[0], name=str(labels), **found[1])
+        if label_layer is not None:
+            viewer.add_labels(label_layer[0], name=str(labels), **label_layer[1])
         if model := records[0].model:
             place = _place(records[0])  # in voxels, for napari takes the points of a slice by whole numbers
             centres = (np.asarray(model["centres"])[:, ::-1] - place["translate"]) / place["scale"]

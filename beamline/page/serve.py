@@ -118,8 +118,8 @@ def _names(listening: socket.socket) -> list[str]:
     host, port = listening.getsockname()[:2]
     address = ipaddress.ip_address(host)
     if address.is_unspecified:
-        found = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
-        numbers = sorted(each for each in found if each.count(".") == 3)
+        addresses = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
+        numbers = sorted(each for each in addresses if each.count(".") == 3)
         names = [socket.gethostname(), "localhost", *numbers]
     else:
         names = [host, "localhost"] if address.is_loopback else [host]

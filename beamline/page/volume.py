@@ -170,11 +170,11 @@ class VolumeFile:
 
 def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
     """The one of these files that was written last; None where none exists."""
-    found = []
+    files = []
     for path in candidates:
         with suppress(OSError):
-            found.append(VolumeFile(path, path.stat().st_mtime_ns))
-    return max(found, key=lambda file: file.changed_ns, default=None)
+            files.append(VolumeFile(path, path.stat().st_mtime_ns))
+    return max(files, key=lambda file: file.changed_ns, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,9 +309,9 @@ class ShownVolume:
         n = int(np.clip(math.ceil(max(abs(r1 - r0), abs(c1 - c0))), 1, 10_000)) + 1
         rows, cols = np.linspace(r0, r1, n), np.linspace(c0, c1, n)
         at = ((rows - shown.first_row) / bin_ - 0.5, (cols - shown.first_col) / bin_ - 0.5)
-        found = map_coordinates(self._meant(values), at, order=1, mode="nearest")
+        sampled = map_coordinates(self._meant(values), at, order=1, mode="nearest")
         length = math.hypot((r1 - r0) * down, (c1 - c0) * across)
-        return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(found).tolist()}
+        return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(sampled).tolist()}
 
     def _at(self, time: int) -> VolumeSlices:
         """At one of the times; a volume that does not change is the same at all."""

@@ -14,7 +14,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.counts import CountModel
-from beamline.projections.corrections.flags import Flags, gap_said
+from beamline.projections.corrections.flags import Flags, gap_sentence
 from beamline.projections.corrections.references import current_scale, use_current
 from beamline.projections.filters import ViewFilters
 from beamline.projections.open_beam import OpenBeam, count_references
@@ -23,7 +23,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.unlit import ViewLight
-from beamline.storage.rules.validate import altered_said
+from beamline.storage.rules.validate import altered_sentence
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons
@@ -58,7 +58,7 @@ class ScanCorrection:
             selection = selection.with_steps(CountModel("log"))
         self._source, self._selection, self._warn = source, selection, warn
         if source.altered:
-            warn(altered_said(source))
+            warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: Mask | None = None  # [row, col] of the rows read, binned; None: not looked for
         if source.quantity == "counts":
@@ -242,7 +242,7 @@ class ScanCorrection:
         unlit = np.array([row for row in asked.tolist() if self._light.known.get(row) is False], np.int64)
         if (news := np.setdiff1d(unlit, sorted(self._told))).size == 0:
             return
-        gap = f", and{gap_text}" if (gap_text := gap_said(self._source, asked, lit)) else ""
+        gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._told.update(news.tolist())
         self._warn(
             f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "

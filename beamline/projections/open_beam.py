@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import Defects, noise_said, photons_of
+from beamline.projections.corrections.counts import Defects, noise_sentence, photons_of
 from beamline.projections.corrections.references import (
     Flats,
     ReferenceCheck,
     current_scale,
-    flats_said,
+    flats_sentence,
     read_references,
     use_current,
     warn_of_parts_without_flats,
@@ -86,7 +86,7 @@ class OpenBeam:
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_said(source, references, factor), noise_said(references, photons)
+        flats, noise = flats_sentence(source, references, factor), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {

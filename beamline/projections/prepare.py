@@ -24,7 +24,7 @@ from beamline.projections.refusals import checked_views
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
-from beamline.projections.truncation import cut_said, cut_sides
+from beamline.projections.truncation import cut_sentence, cut_sides
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import ViewGeometry
 from beamline.storage.readers.base import ScanSource
@@ -238,7 +238,7 @@ def assemble(
     """
     report_defects(projections, warn)
     if sides := cut_sides(projections.data, geometry):
-        warn(cut_said(sides))
+        warn(cut_sentence(sides))
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")

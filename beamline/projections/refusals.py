@@ -15,7 +15,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.treatment import frames_flagged
-from beamline.storage.rules.validate import quantity_said, references_present, scan_ended, scan_findings
+from beamline.storage.rules.validate import quantity_stated, references_present, scan_ended, scan_findings
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -34,8 +34,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     refuse(source, findings)
     usable = usable_views(source, flags.used, judged)
-    if usable.said:
-        warn(usable.said)
+    if usable.sentence:
+        warn(usable.sentence)
     for finding in findings:
         if finding.severity == "warning":
             warn(finding.message)
@@ -52,5 +52,5 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
     checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
-    rules = (quantity_said, references_present, *checked)
+    rules = (quantity_stated, references_present, *checked)
     return [finding for rule in rules for finding in rule(source)]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from beamline.projections.protocols import PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
 from beamline.projections.step import StepDone, key_of, options_of
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -41,7 +41,7 @@ def registered() -> tuple[type[PrepStep], ...]:
     ours: list[type[PrepStep]] = [
         getattr(import_module(f"beamline.projections.corrections.{module}"), cls) for cls, module in REGISTRY.items()
     ]
-    names = {step.name for step in ours}
+    by_name = {step.name: step for step in ours}
     taken = {option.name for step in ours for option in options_of(step).values()}
 
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
@@ -50,14 +50,14 @@ def registered() -> tuple[type[PrepStep], ...]:
             raise ValueError(
                 f"{step.__name__} is no ViewStep, PlaceStep, RayStep or ScanStep of the entry point's name"
             )
-        if names_of_options & taken or not names.issuperset(step.follows):
+        if names_of_options & taken or not by_name.keys() >= set(step.follows):
             raise ValueError(
-                f"it has an option of another step ({names_of_options & taken}), or follows none of {sorted(names)}"
+                f"it has an option of another step ({names_of_options & taken}), or follows none of {sorted(by_name)}"
             )
         taken.update(names_of_options)
         return step
 
-    return (*ours, *plugins("correction", names, fitting).values())
+    return tuple(Registry("correction", by_name, fitting).values())
 
 
 @cache
@@ -90,7 +90,7 @@ def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[st
     records: dict[str, Value] = {}
     for step in steps:
         did = done.get(step.name, StepDone())
-        sentence = {f"{step.name}_said": did.said} if did.said else {}
+        sentence = {f"{step.name}_said": did.sentence} if did.sentence else {}
         records |= _options(step) | sentence if did.parameters is None else did.parameters
     return records
 

@@ -23,7 +23,7 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.rules.references import reference_groups
-from beamline.storage.rules.validate import altered_said
+from beamline.storage.rules.validate import altered_sentence
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
@@ -182,8 +182,8 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
         references=tuple(group.described() for group in groups if group.faults),
-        altered=altered_said(source) if source.altered else "",
-        aside=failures + (judged[-1].aside.said() if judged else ()),
+        altered=altered_sentence(source) if source.altered else "",
+        aside=failures + (judged[-1].aside.in_words() if judged else ()),
         drift=judged[-1].drift if judged else "",
     )
 

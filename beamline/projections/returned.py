@@ -46,7 +46,7 @@ class ReturnedView:
         """The sample stands elsewhere than in the first view, by more than `MOVED` pixels."""
         return max(abs(x) for x in (self.across, self.down, 0.0) if math.isfinite(x)) > MOVED
 
-    def said(self) -> str:
+    def in_words(self) -> str:
         """In words."""
         parts = [f"{self._length(x)} {way}" for x, way in ((self.across, "across"), (self.down, "down"))]
         sure = f" (± {self.sigma:.2g} px)" if math.isfinite(self.sigma) else ""
@@ -94,7 +94,7 @@ def returned_views(source: ScanSource) -> list[ReturnedView]:
         good = (light > 0) & (view > dark)
         return np.where(good, -np.log(np.where(good, view - dark, 1) / np.where(good, light, 1)), np.nan)
 
-    found = []
+    returned = []
     for row in back.tolist():
         apart = np.abs(np.remainder(angles[views] - angles[row] + np.pi, 2 * np.pi) - np.pi)
         if apart.min() * source.shape[1] / 2 > _BESIDE:
@@ -102,8 +102,8 @@ def returned_views(source: ScanSource) -> list[ReturnedView]:
         first = int(views[apart.argmin()])
         shift = _unbinned(shift_between(line_integrals(first), line_integrals(row)), binning)
         sigma = float(np.fmax(shift.across_sigma, shift.down_sigma))
-        found.append(ReturnedView(row, first, float(angles[row]), shift.across, shift.down, sigma, pixel))
-    return found
+        returned.append(ReturnedView(row, first, float(angles[row]), shift.across, shift.down, sigma, pixel))
+    return returned
 
 
 def _unbinned(shift: ViewShift, binning: int) -> ViewShift:

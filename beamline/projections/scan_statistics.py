@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
@@ -170,7 +169,7 @@ class Light:
         """What so many frames cost, by name."""
         return {"photons": self.photons * frames} | ({} if self.gray is None else {"gray": self.gray * frames})
 
-    def said(self) -> list[str]:
+    def in_words(self) -> list[str]:
         """Sentences on all views."""
         each = f"{self.photons:.4g} photons a pixel and view in the open beam"
         out = [f"{each}, {self.photons * self.views:.4g} in {self.views} views"]
@@ -238,6 +237,8 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
 
 def histograms(statistics: list[KindStatistics]) -> bytes:
     """Pixels against their values, a curve a kind, as PNG; at most 400 bins each."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     for each in statistics:

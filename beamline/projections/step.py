@@ -78,12 +78,12 @@ class StepDone:
     """What a step did.
 
     Attributes:
-        said: a sentence; empty where nothing was asked, or nothing found.
+        sentence: a sentence; empty where nothing was asked, or nothing found.
         parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
         warned: a warning told it.
     """
 
-    said: str = ""
+    sentence: str = ""
     parameters: Mapping[str, Value] | None = None
     warned: bool = False
 

@@ -44,7 +44,7 @@ def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
     return {side: level for side, level in levels.items() if level > max(FieldOfViewCheck.edge, _SHARE * depth)}
 
 
-def cut_said(sides: dict[str, float]) -> str:
+def cut_sentence(sides: dict[str, float]) -> str:
     """A warning for `cut_sides`."""
     return (
         f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "

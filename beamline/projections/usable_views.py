@@ -75,7 +75,7 @@ class UsableViews:
         frames: int64 [view], their rows in the file.
         weights: float32 [frame of the file], of each row that is a view; None: one for all.
         left_out: views with an alarm, which are not among them.
-        said: what was done, in a line; empty where no view is flagged.
+        sentence: what was done, in a line; empty where no view is flagged.
         flags: of all frames, which decide the other fields unless they are ignored; None: the file has none.
         regions: parts of views that weigh less, in views that are used otherwise.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
@@ -84,7 +84,7 @@ class UsableViews:
     frames: NDArray[np.int64]
     weights: NDArray[np.float32] | None = None
     left_out: int = 0
-    said: str = ""
+    sentence: str = ""
     flags: FrameFlags | None = None
     regions: Regions = field(default_factory=Regions)
     jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))

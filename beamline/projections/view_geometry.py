@@ -90,8 +90,8 @@ class ViewGeometry:
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
             motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
-            if motion.done.said:
-                warn(motion.done.said)
+            if motion.done.sentence:
+                warn(motion.done.sentence)
             usable = usable.only(motion.frames)
         return usable
 

@@ -199,7 +199,7 @@ def _chosen(
     else:
         return by_curves, f"{expected}the scan has too few rows for a trial in this time"
     count = default_count(part.geometry, part.geometry.sample_pitch)
-    trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
+    trial = RunControl(control.stop, now=control.now).by(control.now() + _TRIAL_SLACK * seconds)
     liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
     order = [liked.index(c) for c in tried]
     at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
@@ -222,14 +222,9 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     if method.traits.held_out:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
-    trials = _until(control, now() + _OF_TRIALS * (end - now()))
-    control = replace(control, should_stop=_until(control, end), stop_trials=trials)
+    trials = control.stop.by(now() + _OF_TRIALS * (end - now()), now)
+    control = replace(control.by(end), stop_trials=trials)
     return recon.reconstruct(data, geometry, method, grid=grid, seed=seed, use=use, control=control)
-
-
-def _until(control: RunControl, end: float) -> Callable[[], bool]:
-    """Stops with `control`, or when its clock shows `end`."""
-    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
 def _named(choice: Choice, result: Reconstruction | None = None) -> str:

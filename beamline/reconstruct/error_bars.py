@@ -70,7 +70,7 @@ def deviation_of(
         ValueError: as `recon.error_bars.error_bars`.
     """
     bars = _bars(method, prepared, options, volume, decided, control)
-    if control.should_stop is not None and control.should_stop():  # a direct method does not ask
+    if control.stop():  # a direct method does not ask
         return None
     return None if bars is None else Volume(bars.deviation, volume.grid)
 
@@ -100,7 +100,7 @@ def deviation_by_slabs(
             continue
         here = Volume(np.ascontiguousarray(volume.data[slab.slices]), box)
         bars = _bars(method, part, options, here, decided, control)
-        if bars is None or (control.should_stop is not None and control.should_stop()):
+        if bars is None or control.stop():
             return None
         decided = bars.decided
         for z, share, values in zip(range(*slab.slices.indices(len(out))), slab.share, bars.deviation, strict=True):

@@ -35,12 +35,14 @@ class FollowTiming:
         poll: between looks at the file while there is nothing to fit.
         slice: of fitting between looks at the file.
         snapshot: between intermediate volumes.
+        picture: between slices by FBP, at least; drawing them takes at most half of the time.
         patience: without a new frame, before a file without the lock of its writer counts as one that died.
     """
 
     poll: float = 0.1
     slice: float = 0.25
     snapshot: float = 5.0
+    picture: float = 0.3
     patience: float = PATIENCE
 
 
@@ -113,8 +115,8 @@ def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTimi
     warm_up(R2(finish=0), on_kernel=compiled)
     picture = options.target.live_picture
     message = (
-        f"The live volume is ready for views. To watch it grow, open {picture}: drawn anew about every "
-        f"{rhythm.snapshot:g} s, as soon as there are views enough"
+        f"The live volume is ready for views. To watch it grow, open {picture}: slices from the eighth "
+        f"view on, and the volume, drawn anew about every {rhythm.snapshot:g} s"
     )
     sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
@@ -157,6 +159,7 @@ def _watch(follower: ScanFollower, clock: Clock, rhythm: FollowTiming, should_st
                 f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
                 f"and with --unfinished the {follower.n_views} views that are there are used."
             )
+        follower.draw_slices(rhythm.picture)
         if not follower.advance(rhythm.slice):
             clock.sleep(rhythm.poll)
         elif clock.now() - last_snapshot >= rhythm.snapshot:

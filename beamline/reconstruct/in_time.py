@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
@@ -16,6 +15,7 @@ from beamline.reconstruct.output_paths import OutputPaths
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.method import BoundedMethod
+from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.methods import by_name, with_settings
 from recon.splatting.in_time import first_sweep_seconds
@@ -28,25 +28,6 @@ _FORWARD = 0.5  # of a sweep
 _LEAST = 0.1  # of a sweep: the time of a start from coarse views and one step
 
 
-@dataclass(frozen=True, eq=False)
-class Deadline:
-    """When a call should end.
-
-    Attributes:
-        end: by the clock; inf without a deadline.
-        after: approximate s for the report and writing.
-        now: the clock.
-    """
-
-    end: float = math.inf
-    after: float = 0.0
-    now: Callable[[], float] = time.perf_counter
-
-    def leaves(self, seconds: float) -> bool:
-        """Whether there is time for so many s before the report."""
-        return self.now() + seconds + self.after <= self.end
-
-
 def fit_within(
     method: BoundedMethod,
     prepared: PreparedProjections,
@@ -54,8 +35,8 @@ def fit_within(
     started: tuple[float, float],
     clock: Clock,
     warn: Warn,
-) -> tuple[BoundedMethod, Deadline]:
-    """The fit with the seconds that its call leaves it, before measuring, report and writing; and when the call ends.
+) -> tuple[BoundedMethod, Stop]:
+    """The fit with the seconds that its call leaves it, before measuring, report and writing; and when these begin.
 
     If they are too few, `warn` is told the expected duration before the fit.
 
@@ -85,8 +66,8 @@ def fit_within(
                 f"end is in about {duration_text(least + measuring + after)}"
             )
         warn(f"{sentence}.")
-    deadline = Deadline(started[0] + method.seconds, after, clock.now)
-    return with_settings(method, {"seconds": max(remaining, 0.0)}), deadline
+    before_report = Stop(deadline=started[0] + method.seconds - after, now=clock.now)
+    return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
 
 
 @contextmanager

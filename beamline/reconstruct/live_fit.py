@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.jumps import Jumps
@@ -35,6 +34,7 @@ from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.followed_views import Cursor, FollowedViews
+from beamline.reconstruct.live_slices import LiveSlices
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.snapshots import Snapshots
@@ -42,8 +42,11 @@ from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.stop import Stop
+from recon.base.volume import Grid
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.finish import finish
+from recon.splatting.in_time import FINISH_SHARE, FinishPlan, finish_within
 from recon.splatting.stream import StreamingFit
 
 _BATCH = 32  # views corrected before the fit goes on
@@ -82,6 +85,7 @@ class ScanFollower:
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
+        self._slices = LiveSlices(self._views, self.snapshots, clock)
 
     @property
     def axis_col(self) -> float | None:
@@ -294,6 +298,17 @@ class ScanFollower:
         message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
         self._sink(StateEntered("gain", message, gain, time=self._clock.now()))
 
+    def draw_slices(self, pause: float) -> None:
+        """Draw slices of the views so far, if there are new ones, and `pause` s have passed.
+
+        Before the axis is known they are about the middle of the detector.
+        """
+        if self.state is FollowState.WAITS_FOR_AXIS and self._correction is not None:
+            self._slices.draw_about_middle(self._correction.renewed, pause)
+        elif self.state is FollowState.FEEDS:
+            newest = () if self._cursor.newest is None else (self._cursor.newest,)
+            self._slices.draw((*self._cursor.batches, *newest), self.axis_col, pause)
+
     def write_snapshot(self) -> None:
         """Write the present volume and its picture, in place of the last ones."""
         assert self._fit is not None
@@ -302,7 +317,7 @@ class ScanFollower:
     def finish(
         self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
     ) -> tuple[Reconstruction, PreparedProjections]:
-        """The last round over all views in `seconds` or until `should_stop`, with snapshots.
+        """The last round over all views and the sweeps after it, in `seconds` or until `should_stop`, with snapshots.
 
         Returns the volume, and the line integrals that it grew from, to judge it by.
 
@@ -323,7 +338,12 @@ class ScanFollower:
         prepared = self._prepared(self.axis_col, usable)
         self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
 
-        last, stop_latch = self._clock.now(), StopLatch(should_stop)
+        begin = last = self._clock.now()
+        stop, wanted = Stop(should_stop), self._options.streaming.finish_sweeps
+        plan = FinishPlan(0, 0.0)
+        if wanted:
+            grid = Grid.matching(prepared.geometry)
+            plan = finish_within(FINISH_SHARE * seconds, 0.0, prepared.geometry, grid, self._clock.now)
 
         def on_progress(progress: Progress) -> bool:
             nonlocal last
@@ -331,27 +351,29 @@ class ScanFollower:
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return stop_latch()
+            return stop()
 
         try:
-            self._say(self._fit.finish(seconds, on_progress))
+            self._say(self._fit.finish(max(begin + seconds - plan.seconds - self._clock.now(), 0.0), on_progress))
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians
-        sweeps = self._options.streaming.finish_sweeps
-        if sweeps and gaussians is not None and not stop_latch():
+        sweeps = wanted if plan.sweeps is None else min(wanted, plan.sweeps)
+        if sweeps and gaussians is not None and not stop():
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())
             problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
             say = progress_events(self._sink, self._clock)
-            control = RunControl(stop_latch, say, now=self._clock.now)
+            late = stop.by(begin + seconds, self._clock.now)
+            trials = None if plan.trials else lambda: True
+            control = RunControl(late, say, now=self._clock.now, stop_trials=trials)
             volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, control)
         settings: dict[str, object] = {
             **asdict(self._fit.settings),
             "finish": sweeps,
             "seconds_after_scan": seconds,
             "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if stop_latch.stopped else {}),
+            **({"ended_early": True} if stop.stopped else {}),
         }
         method, elapsed = self._options.method.name, self._clock.now() - self._begin
         history = tuple(self._history)
@@ -382,11 +404,11 @@ class ScanFollower:
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
-                if done[step.name].said:
+                if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
                     self._fit.replace_views(projections.data)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""
-        corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)
+        corrections_done({name: each.sentence for name, each in done.items()}, self._sink, self._clock)

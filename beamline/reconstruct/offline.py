@@ -17,14 +17,14 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
-from beamline.core.stop import StopLatch, StopScope, never_stopped
+from beamline.core.stop import StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
 from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by, refuse_impossible, refuse_views
-from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
+from beamline.reconstruct.in_time import fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReportContext, facts_of
@@ -52,6 +52,7 @@ from recon.base.method import (
     volumes_of,
 )
 from recon.base.slabs import Slab
+from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.backend import backend_for
@@ -91,28 +92,28 @@ def reconstruct_file(
     region = None if options.region is None else locate(options.region, options.selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
         phases.enter("compiling kernels")
-        job = _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region)
+        job = _Job(options, prepared, sink, clock, Stop(), warn, region)
         job.compile_kernels()
         phases.enter("reconstruction")
-        deadline = Deadline()
+        before_report = Stop()
         if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
-            method, deadline = fit_within(options.method, prepared, options.target, (started, worked), clock, warn)
+            method, before_report = fit_within(options.method, prepared, options.target, (started, worked), clock, warn)
             job = replace(job, options=replace(options, method=method))
         # A direct method and a slab have no volume so far: a signal interrupts them.
         stopping = never_stopped if job.options.method.traits.direct or slabs else stop_scope
         decided = Decisions(options.seed)
         with stopping() as stopped, warnings_told(warn):
-            done = _volume(replace(job, stop_latch=StopLatch(stopped)), slabs, decided)
+            done = _volume(replace(job, stop=Stop(stopped)), slabs, decided)
         if options.uncertainty:
             phases.enter("error bars")
             with stop_scope() as stopped, warnings_told(warn):
-                job = replace(job, stop_latch=StopLatch(stopped))
+                job = replace(job, stop=Stop(stopped))
                 done = replace(done, made=_with_error_bars(job, done.made, slabs, decided))
         selection = replace(options.selection, binning=options.selection.binning * done.factor)
         truth = None if truth_given is None else fit_truth(truth_given, done.made.volume.grid, selection.binning)
         context = ReportContext(
             facts, selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
-            region=region, phases=phases, leaves=deadline.leaves, filter=options.filter, chosen=done.chosen,
+            region=region, phases=phases, leaves=before_report.leaves, filter=options.filter, chosen=done.chosen,
         )  # fmt: skip
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         with stopping():  # the volume is there: the first signal no longer discards it
@@ -177,7 +178,7 @@ def require_finished(source: ScanSource, options: ReconOptions) -> None:
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Report the requested corrections of the views, then send the event `recon_started`."""
-    corrections_done({name: done.said for name, done in prepared.done.items() if not done.warned}, sink, clock)
+    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
     more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(
@@ -209,7 +210,7 @@ class _Job:
     prepared: PreparedProjections
     sink: Sink
     clock: Clock
-    stop_latch: StopLatch
+    stop: Stop
     warn: Warnings
     region: RegionOfRows | None = None
 
@@ -270,7 +271,7 @@ class _Job:
         # Rays that weigh nothing were filled on disk, as a direct method does it.
         filled = method.traits.direct and prepared.on_disk
         weights = None if filled else prepared.ray_weights(len(held_out))
-        control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
+        control = replace(control, should_stop=self.stop, now=self.clock.now)
         with self.refused(f" by {method.name}"):
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
@@ -317,7 +318,7 @@ def _with_error_bars(job: _Job, made: Reconstruction, slabs: Sequence[Slab], dec
     message = "The volume is there; its error bars follow. Ctrl-C leaves them out."
     job.sink(StateEntered("error_bars", message, time=job.clock.now()))
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
-    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
+    control = RunControl(job.stop, job.listener(), now=job.clock.now)
     given = made.volume, method, job.prepared, job.options
 
     why = "as they were stopped"
@@ -373,7 +374,7 @@ def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     # The sweeps of a finish, and the factors of volumes in time, follow the last step, and can be stopped as well.
     finishes = method.traits.in_time or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
-    early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
+    early = job.stop.stopped if finishes else job.stop.cut(reached, planned)
     resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return _recorded(result, early, resumed | ({"checkpoint_lost": lost} if lost else {})), chosen
 
@@ -381,14 +382,14 @@ def _at_once(job: _Job, decided: Decisions) -> tuple[Reconstruction, str]:
 def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> tuple[Reconstruction, str]:
     """Run a method slab by slab. Then what was chosen."""
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
-    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now, decide=decided)
+    control = RunControl(job.stop, job.listener(), now=job.clock.now, decide=decided)
 
     with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
         workers = None
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
         result = in_slabs(job.run_on, job.prepared, options, slabs, control, job.say, job.warn, workers)
-    return _recorded(result, job.stop_latch.stopped), _chosen(result)
+    return _recorded(result, job.stop.stopped), _chosen(result)
 
 
 def _chosen(result: Reconstruction) -> str:
@@ -400,8 +401,8 @@ def _chosen(result: Reconstruction) -> str:
 def _within_budget(job: _Job, budget: float) -> _Done:
     """Reconstruct within `budget` s, from pixels that may be joined."""
     methods, largest = candidates_of(job.options.method), None if job.region is None else 1
-    control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
+    control = RunControl(job.stop, job.listener(budget), now=job.clock.now)
     with job.refused():
         done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
-    made = _recorded(replace(done.result, seconds=done.seconds), job.stop_latch.stopped, done.settings(budget))
+    made = _recorded(replace(done.result, seconds=done.seconds), job.stop.stopped, done.settings(budget))
     return _Done(made, done.summary(budget), done.prepared, done.choice.binning)

@@ -122,9 +122,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
     returned = returned_views(source)
     if returned:
-        table["views on the way back"] = "; ".join(view.said() for view in returned)
+        table["views on the way back"] = "; ".join(view.in_words() for view in returned)
     remarks = [] if flags is None else reasons(flags)
-    remarks += [f"On the way back {view.said()} since the first view." for view in returned if view.moved]
+    remarks += [f"On the way back {view.in_words()} since the first view." for view in returned if view.moved]
     flagged = [] if flags is None else worst_frames(source, flags)
     frames = f"{n}/{n + missing}"
     images = reference_images(source)

@@ -81,7 +81,7 @@ def hiding_warning(made: Reconstruction, structure: unexplained.Unexplained) -> 
     )
 
 
-def _crossing_said(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int64], first: int, side: int) -> str:
+def _crossing_sentence(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int64], first: int, side: int) -> str:
     """Odd views that one object makes on its way through the field."""
     rows = min(odd.rows[0] for odd in parts), max(odd.rows[1] for odd in parts)
     speed = odd_views.speed_of(parts) * side
@@ -136,7 +136,7 @@ def odd_views_warning(
     first, side = (selection.rows or (0, 0))[0], selection.binning
     frames = prepared.projections.view_ids
     crossing = odd_views.on_a_line(found)
-    places = [_crossing_said(crossing, frames, first, side)] if crossing else []
+    places = [_crossing_sentence(crossing, frames, first, side)] if crossing else []
     places += [
         f"frame {prepared.projections.view_ids[odd.view]}, rows {first + odd.rows[0] * side} ... "
         f"{first + odd.rows[1] * side - 1}, columns {odd.cols[0] * side} ... {odd.cols[1] * side - 1} "

@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from beamline.core.errors import DataError
-from beamline.core.events import Sink, SnapshotWritten
+from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
 from beamline.reconstruct.options import ReconOptions
@@ -27,6 +26,11 @@ from recon.base.arrays import F32
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 from recon.splatting.stream import StreamingFit
+from recon.voxels.slices import OrthogonalSlices
+
+if TYPE_CHECKING:
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.figure import Figure
 
 
 class Snapshots:
@@ -40,6 +44,9 @@ class Snapshots:
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
         self.picture_path = options.target.live_picture
         self.drawn = False  # the picture is of this scan
+        self._slices: tuple[PictureRow, ...] = ()  # of the picture, as drawn last: by FBP, and of the volume
+        self._grown: tuple[PictureRow, ...] = ()
+        self._at: Sequence[float] | None = None  # z, y and x of the slices by FBP
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
@@ -55,102 +62,134 @@ class Snapshots:
         )
         try:
             write_reconstruction(self.path, record, replace=True)
-            self._write_picture(fit, record.volume)
+            self._grown = self._rows(fit, record.volume)
+            self._write_picture()
         except DataError as error:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
             self._warn(f"A snapshot was left out: {error}")
             return
-        self.drawn = True
         now = self._clock.now()
         written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
         self._sink(SnapshotWritten(*written, time=now))
+
+    def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str) -> None:
+        """The picture with these slices by FBP, above those of the volume when it was last drawn, if there is one."""
+        self._at = slices.at
+        self._slices = (PictureRow(heading, _slice_panels(slices.images, slices.at, slices.pixel, self._unit)),)
+        try:
+            self._write_picture()
+        except DataError as error:
+            self._warn(f"A picture was left out: {error}")
+            return
+        self._sink(SlicesDrawn(self.picture_path, n_views, math.degrees(slices.covered), time=self._clock.now()))
 
     def remove(self) -> None:
         """Remove the snapshot after the volume is delivered. The picture of the growing volume stays."""
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 
-    def _write_picture(self, fit: StreamingFit, volume: Volume) -> None:
+    def _rows(self, fit: StreamingFit, volume: Volume) -> tuple[PictureRow, ...]:
         new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""
-        title = (
+        heading = (
             f"{fit.n_views} views so far, {new}{fit.progress().n_gaussians} Gaussians, "
             f"{self._clock.now() - self._begin:.0f} s after the first look"
         )
-        picture = LivePicture(volume, *fit.newest_view(), title, self._unit)
-        write_whole(self.picture_path, picture.png(), replace=True)
+        return volume_rows(volume, *fit.newest_view(), heading, self._unit, self._at)
+
+    def _write_picture(self) -> None:
+        write_whole(self.picture_path, live_picture((*self._slices, *self._grown)), replace=True)
+        self.drawn = True
 
 
 _DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
 _SIGMAS = 5.0  # range of the differences
-_DIFFERENCES = LinearSegmentedColormap.from_list("differences", ["tab:blue", "white", "tab:red"])
 
 
 @dataclass(frozen=True, eq=False)
-class LivePicture:
-    """What a picture shows.
+class PictureRow:
+    """Panels side by side, below a heading of one line; "": none."""
 
-    Attributes:
+    heading: str
+    panels: Sequence[_Panel]
+
+
+def live_picture(rows: Sequence[PictureRow]) -> bytes:
+    """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
+    from matplotlib.figure import Figure
+
+    across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
+    tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
+    headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
+    width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
+    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+    top = height
+    for row, pixels in zip(rows, tall, strict=True):
+        if row.heading:
+            top -= 2 * _LINE
+            figure.text(_GAP / width, (top + 0.4 * _LINE) / height, row.heading, fontsize=9, weight="bold")
+        for k, panel in enumerate(row.panels):
+            panel.draw(figure, _GAP + k * across, top - _GAP)
+        top -= _GAP + 2 * _LINE + pixels
+    return png(figure, compression=1)
+
+
+def volume_rows(
+    volume: Volume, view: F32, render: F32, heading: str, unit: str, place: Sequence[float] | None = None
+) -> tuple[PictureRow, PictureRow]:
+    """Slices of a volume; the newest view, the same view of the volume, their difference.
+
+    Args:
         volume: so far, 1/unit.
         view, render: the newest view [row, col] and the same view of the volume, line integrals.
-        title: of the whole, one line.
+        heading: of the whole, one line.
         unit: of length, "mm" or "px".
+        place: z, y and x of the slices; None: through what is bright.
     """
-
-    volume: Volume
-    view: F32
-    render: F32
-    title: str
-    unit: str
-
-    def png(self) -> bytes:
-        """The picture. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
-        rows = (self._slices(), self._views())
-        across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row)) + _GAP
-        tall = [max(panel.pixels.shape[0] for panel in row) for row in rows]
-        width, height = 3 * across + _GAP, sum(tall) + 2 * (2 * _LINE + _GAP) + 2 * _LINE + _GAP
-        figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
-        top = height - 2 * _LINE
-        figure.text(_GAP / width, (top + 0.4 * _LINE) / height, self.title, fontsize=9, weight="bold")
-        for row, pixels in zip(rows, tall, strict=True):
-            for k, panel in enumerate(row):
-                panel.draw(figure, _GAP + k * across, top - _GAP)
-            top -= _GAP + 2 * _LINE + pixels
-        return png(figure, compression=1)
-
-    def _slices(self) -> list[_Panel]:
-        grid, data = self.volume.grid, self.volume.data
+    grid, data = volume.grid, volume.data
+    if place is None:
         k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
         z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
-        at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
-        images = (data[z], data[:, y], data[:, :, x])
-        window = grey_window(images)
-        grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{self.unit}"
-        labels = (
-            f"x → y ↓ at z = {at[0]:.3g} {self.unit}",
-            f"x → z ↓ at y = {at[1]:.3g}",
-            f"y → z ↓ at x = {at[2]:.3g}",
-        )
-        notes = (grey, "the same greys and scale", "the same greys and scale")
-        pixels, zoom = _sized(images)
-        bar = grid.voxel_size / zoom, self.unit
-        return [
-            _Panel(image, "gray", window, label, note, None if k else bar)
-            for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
-        ]
+    else:
+        z, y, x = (int(np.abs(axis - to).argmin()) for axis, to in zip(grid.coordinates(), place, strict=True))
+    at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
+    panels = _slice_panels((data[z], data[:, y], data[:, :, x]), at, grid.voxel_size, unit)
+    return PictureRow(heading, panels), PictureRow("", _view_panels(view, render))
 
-    def _views(self) -> list[_Panel]:
-        window = grey_window([self.view], 0.5, 99.5)
-        noise = noise_level(self.view[None]) or 0.01 * (window[1] - window[0])
-        left = (self.view - self.render) / np.float32(noise)
-        greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
-        spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(left**2))):.2f}"
-        (view, render, left), _ = _sized((self.view, self.render, left))
-        return [
-            _Panel(view, "gray", window, "newest view, u → z ↓", greys),
-            _Panel(render, "gray", window, "the volume seen from there", "the same greys"),
-            _Panel(left, _DIFFERENCES, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
-        ]
+
+def _slice_panels(images: Sequence[F32], at: Sequence[float], pixel: float, unit: str) -> list[_Panel]:
+    """Slices across z, y and x at these places, in the same greys."""
+    window = grey_window(images)
+    grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
+    labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
+    notes = (grey, "the same greys and scale", "the same greys and scale")
+    pixels, zoom = _sized(images)
+    bar = pixel / zoom, unit
+    return [
+        _Panel(image, "gray", window, label, note, None if k else bar)
+        for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
+    ]
+
+
+def _view_panels(view: F32, render: F32) -> list[_Panel]:
+    window = grey_window([view], 0.5, 99.5)
+    noise = noise_level(view[None]) or 0.01 * (window[1] - window[0])
+    difference = (view - render) / np.float32(noise)
+    greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
+    spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
+    (view, render, difference), _ = _sized((view, render, difference))
+    return [
+        _Panel(view, "gray", window, "newest view, u → z ↓", greys),
+        _Panel(render, "gray", window, "the volume seen from there", "the same greys"),
+        _Panel(difference, _differences(), (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
+    ]
+
+
+@cache
+def _differences() -> LinearSegmentedColormap:
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("differences", ["tab:blue", "white", "tab:red"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,6 +223,8 @@ class _Panel:
 
     def _scale(self, figure: Figure, x: int, y: int, pixel: float, unit: str) -> None:
         """A bar of a round length, at most a third of the image."""
+        from matplotlib.lines import Line2D
+
         length = round_length(pixel * self.pixels.shape[1] / 3)
         bar = Line2D([x, x + length / pixel], [y, y], color="tab:orange", lw=3, transform=None, solid_capstyle="butt")
         figure.add_artist(bar)

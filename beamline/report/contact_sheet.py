@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
-from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from beamline.report.figures import DPI, WIDTH, GreyWindow, grey_window, png, show_grey
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
 
 COLUMNS = 4
 _COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
@@ -40,6 +41,9 @@ class FlaggedFrame:
 
 def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     """The frames as PNG, row 0 at the top, in one grey window, with a box around each region."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
     down = -(-len(frames) // COLUMNS)
     lines = max(len(frame.reasons) for frame in frames)
     rows, cols = frames[0].extent
@@ -70,6 +74,8 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
         images: [row, col] by title, counts or ratios, binned where they are large.
         shape: (rows, cols) of the detector.
     """
+    from matplotlib.figure import Figure
+
     rows, cols = shape
     width = WIDTH / max(len(images), 2)
     size = (width * len(images), float(np.clip(0.8 * width * rows / cols, 0.6, 4.0)) + 0.6)

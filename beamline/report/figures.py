@@ -5,15 +5,9 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
-from matplotlib.patches import Wedge as Sector
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -21,6 +15,12 @@ from beamline.core.voxel_kind import VoxelKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.view_weights import Wedge
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 GreyWindow = tuple[float, float]
 DPI = 110
@@ -53,7 +53,7 @@ def show_grey(
         extent: edges left, right, bottom, top; None: pixels.
     """
     return axes.imshow(
-        image, cmap="gray", norm=Normalize(*window), extent=extent, aspect="auto" if stretched else "equal",
+        image, cmap="gray", vmin=window[0], vmax=window[1], extent=extent, aspect="auto" if stretched else "equal",
         interpolation="nearest",
     )  # fmt: skip
 
@@ -78,6 +78,8 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
 
 def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     """All views of one detector row, in order of angle."""
+    from matplotlib.ticker import MaxNLocator
+
     order = np.argsort(geometry.angles, kind="stable")
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
@@ -120,6 +122,9 @@ def orthogonal_slices(
         kind: what the voxels are.
         percentiles: of all the values shown, which become black and white.
     """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
@@ -154,6 +159,9 @@ def orthogonal_slices(
 
 def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """What each volume has more (red) or less (blue) than the first one, in the slice z of `orthogonal_slices`."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     (first, reference), *others = volumes.items()
     z = bright_centre(list(volumes.values())[-1].data)[0]
     images = [volume.data[z] - reference.data[z] for _, volume in others]
@@ -166,7 +174,7 @@ def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = Voxe
     for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
         shown = axes.imshow(
             image, cmap="RdBu_r", extent=(*_edges(cx, nx, size), *_edges(cy, ny, size)[::-1]),
-            norm=Normalize(-reach, reach), interpolation="nearest",
+            vmin=-reach, vmax=reach, interpolation="nearest",
         )  # fmt: skip
         axes.tick_params(labelsize=7)
         axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
@@ -182,6 +190,9 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
     voxel. So single noisy voxels are no edges.
     """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
     last = list(volumes.values())[-1].data
     z = bright_centre(last)[0]
     smooth = np.pad(ndimage.gaussian_filter(last[z].astype(np.float64), 1.0), 1, mode="edge")
@@ -215,7 +226,7 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
     figure, axes = _figure((6.4, 5.4))
     (y, x), (_, cy, cx) = image.shape, grid.centre
     extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
-    shown = axes.imshow(image, cmap="RdBu_r", extent=extent, norm=Normalize(-8, 8), interpolation="nearest")
+    shown = axes.imshow(image, cmap="RdBu_r", extent=extent, vmin=-8, vmax=8, interpolation="nearest")
     axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
     figure.colorbar(shown, ax=axes, label="standard deviations of the noise", pad=0.02)
     return png(figure)
@@ -234,6 +245,8 @@ def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKin
 
 def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     """A slice through the bright voxels, with the directions of rays that no view shows as sectors about the axis."""
+    from matplotlib.patches import Wedge as Sector
+
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = _figure((6.4, 5.4))
     edges = planes(grid)[0][2:]
@@ -251,6 +264,8 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
 def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
+    from matplotlib.figure import Figure
+
     at = bright_centre(volume.data)[0]
     grid = volume.grid
     figure = Figure(figsize=(WIDTH, 4.4), dpi=dpi_for(grid.shape[2], WIDTH / 2.4), layout="constrained")
@@ -263,7 +278,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
     for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
         image = shown.data[at]
         low, high = grey_window([image], 0.5, 99.5)
-        drawn = axes.imshow(image, cmap=colours, extent=extent, norm=Normalize(low, high), interpolation="nearest")
+        drawn = axes.imshow(image, cmap=colours, extent=extent, vmin=low, vmax=high, interpolation="nearest")
         left, top = extent[0] + length / 4, extent[3] + length / 4
         axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")
         axes.text(left, top + length / 8, f"{length:g} {unit}", color="white", fontsize=8, va="top")
@@ -294,14 +309,16 @@ def pose_curves(
     angles_deg: NDArray[np.float64], shifts: NDArray[np.float64], turns_deg: NDArray[np.float64], unit: str
 ) -> bytes:
     """Displacement (col, row) in `unit`, and roll and tilt in degrees, of the views [view, 2] against their angle."""
+    from matplotlib.figure import Figure
+
     curves = [(shifts, unit, ("along the columns", "along the rows")), (turns_deg, "degrees", ("roll", "tilt"))]
     shown = [curve for curve in curves if curve[0].any()]
     figure = Figure(figsize=(WIDTH, 2.4 * len(shown)), dpi=DPI, layout="constrained")
     order = np.argsort(angles_deg, kind="stable")
-    for axes, (values, said, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
+    for axes, (values, label, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
         for column, name in enumerate(names):
             axes.plot(angles_deg[order], values[order, column], lw=1.0, marker=".", ms=2, label=name)
-        axes.set(xlabel="angle (degrees)", ylabel=said)
+        axes.set(xlabel="angle (degrees)", ylabel=label)
         axes.legend(fontsize=8)
         axes.grid(alpha=0.3)
     return png(figure)
@@ -335,12 +352,21 @@ def dpi_for(voxels: int, inches: float) -> float:
 
 
 def _figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=size, dpi=DPI, layout="constrained")
     return figure, figure.subplots()
+
+
+def canvas(figure: Figure) -> FigureCanvasAgg:
+    """What draws a figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    return FigureCanvasAgg(figure)
 
 
 def png(figure: Figure, compression: int = 6) -> bytes:
     """The figure's bytes as PNG; `compression` 1 takes the least time, 9 gives the fewest bytes."""
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={"compress_level": compression})
+    canvas(figure).print_png(buffer, pil_kwargs={"compress_level": compression})
     return buffer.getvalue()

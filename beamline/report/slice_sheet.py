@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from beamline.report.figures import WIDTH, bright_centre, dpi_for, grey_window, png
 from recon.base.arrays import F32
@@ -39,6 +38,8 @@ class SliceSheet:
 
     def png(self, labels: Sequence[str]) -> bytes:
         """These slices, four beside one another, in the grey window of the first."""
+        from matplotlib.figure import Figure
+
         low, high = grey_window([self._shown[labels[0]]])
         rows, cols = self._shown[labels[0]].shape
         head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)

@@ -224,21 +224,21 @@ class Acquisition:
 
     def _remembered_places(self, kind: FrameKind) -> dict[str, Callable[[], str]]:
         """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
-        shutter, found = self._devices.shutter, dict[str, Callable[[], str]]()
+        shutter, remembered = self._devices.shutter, dict[str, Callable[[], str]]()
         if not shutter.by_hand:
             # A scan that is stopped in a pause ends with a closed one.
-            found[shutter.name] = lambda: "" if self._stop.stopping else _wrong_shutter(kind, shutter.is_open())
+            remembered[shutter.name] = lambda: "" if self._stop.stopping else _wrong_shutter(kind, shutter.is_open())
         for device in (self._devices.sample, self._devices.filter, self._devices.monochromator):
             if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
-                found[device.name] = device.remember_place()
-        return found
+                remembered[device.name] = device.remember_place()
+        return remembered
 
     def _require_in_place(self, looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range) -> None:
         """InstrumentError if a device that was moved and then believed is no longer where it stood before a block."""
-        moved = {name: said for name, look in looks.items() if (said := look())}
+        moved = {name: problem for name, look in looks.items() if (problem := look())}
         if moved and rows and not self._stop.aborting:
             raise InstrumentError(
-                f"{'; '.join(f'{name}: {said}' for name, said in moved.items())}. It was moved while "
+                f"{'; '.join(f'{name}: {problem}' for name, problem in moved.items())}. It was moved while "
                 f"{count(len(rows), kind.name.lower())} (frames {spans(list(rows))} of the file) were taken: which of "
                 "them show it elsewhere is not known, so none should be used. Look who or what moved it, bring it "
                 "back, and take the scan again. What was taken before is good."
@@ -347,8 +347,8 @@ def _wrong_shutter(kind: FrameKind, is_open: bool) -> str:
     """What is wrong with a shutter for this kind of frame; "" if it is as it must be."""
     if is_open is not (kind is FrameKind.DARK):
         return ""
-    wanted, found = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
-    return f"it is {found}, {kind.name.lower()}s need it {wanted}"
+    wanted, actual = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
+    return f"it is {actual}, {kind.name.lower()}s need it {wanted}"
 
 
 def _state_of(block: Block) -> State:

@@ -118,21 +118,21 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
     integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / light) for frame in views]
     one, other = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
     try:
-        found = align_pair(one, other)
+        pair = align_pair(one, other)
     except AxisError as error:
         raise QualityError(f"The two views show no axis: {error}") from error
-    if not found.confident:
+    if not pair.confident:
         raise QualityError(
-            f"The two views do not match: the axis may be near column {found.axis_col:.1f}, or not. Take a sample with "
+            f"The two views do not match: the axis may be near column {pair.axis_col:.1f}, or not. Take a sample with "
             "more contrast that stays in the field of view, and look at the flats."
         )
-    offset = found.axis_col - (dark.shape[1] - 1) / 2
+    offset = pair.axis_col - (dark.shape[1] - 1) / 2
     return Alignment(
-        axis_col=found.axis_col,
+        axis_col=pair.axis_col,
         offset=offset,
         offset_mm=offset * pixel_size,
-        tilt=found.tilt,
-        uncertainty=found.uncertainty,
+        tilt=pair.tilt,
+        uncertainty=pair.uncertainty,
         detail=finest_structure(integrals[0], integrals[1]),
         angle=views[0].angle,
         rows=dark.shape[0],

@@ -216,9 +216,9 @@ def state_of(run: Path) -> State:
     state = State.IDLE
     with suppress(OSError), open_below(run, EVENTS) as file:
         for line in whole_lines(file):
-            said = event_in(line) if line.startswith(b'{"event": "state"') else None
-            if said is not None and "source" not in said and said.get("state") in [*State]:
-                state = State(said["state"])  # without those of the live reconstruction
+            event = event_in(line) if line.startswith(b'{"event": "state"') else None
+            if event is not None and "source" not in event and event.get("state") in [*State]:
+                state = State(event["state"])  # without those of the live reconstruction
     return state
 
 

@@ -70,16 +70,16 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
         DataError: none has one.
     """
     runs = _runs(folder, load(folder / CONFIG, environment={}))
-    found = [scan_file(run) for run in runs if run is not None]
+    files = [scan_file(run) for run in runs if run is not None]
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
-    if found and len(whole) < len(runs):
+    if files and len(whole) < len(runs):
         warn(
-            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan, and {len(found)} are used. "
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan, and {len(files)} are used. "
             f"`beamline scan --resume {folder}` takes the rest."
         )
-    if not found:
+    if not files:
         raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
-    return found
+    return files
 
 
 def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
@@ -130,8 +130,8 @@ def run_energies(
                 scans.append((energy, job))
                 continue
             _tell(StateEntered("energies", f"Energy {n} of {len(each)}: {energy:.7g} keV"), sinks)
-            for said in job.left_out if job else ():
-                _tell(Warned(said), sinks)
+            for warning in job.left_out if job else ():
+                _tell(Warned(warning), sinks)
             try:
                 how = commands(one, job)
                 if how.remark:
@@ -158,10 +158,10 @@ def _runs(series: Path, config: Config) -> list[Path | None]:
     """The newest run folder of each energy of a series; None: there is none."""
     if not is_series(series):
         raise ConfigError(f"{series} is no folder of a series of energies. Nothing was changed.")
-    found = dict[float | None, Path]()
+    run_of_energy = dict[float | None, Path]()
     for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
-        found[load(run / CONFIG, environment={}).scan.energy] = run
-    return [found.get(energy) for energy in config.scan.energies or ()]
+        run_of_energy[load(run / CONFIG, environment={}).scan.energy] = run
+    return [run_of_energy.get(energy) for energy in config.scan.energies or ()]
 
 
 def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:

@@ -76,11 +76,11 @@ class DryRun:
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
         if each := self.energies:
             seconds = sum(need.duration for need in each)
-            said = (
+            sentence = (
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
                 f"{duration_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
             )
-            lines.insert(len(lines) - len(self.timeline.violations), f"{'energies':<10}{said}")
+            lines.insert(len(lines) - len(self.timeline.violations), f"{'energies':<10}{sentence}")
         return lines
 
     def data(self) -> Mapping[str, Any]:
@@ -135,22 +135,22 @@ def dry_run(
         DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
         for one, plan in zip(each, plans, strict=True)
     ]
-    found = worked[0] if settings.scan.energies is None else _of_energies(worked)
-    return replace(found, timeline=_lockable(found.timeline, there))
+    worked_plan = worked[0] if settings.scan.energies is None else _of_energies(worked)
+    return replace(worked_plan, timeline=_lockable(worked_plan.timeline, there))
 
 
 def _of_energies(each: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the violations of all of them."""
     needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
-    found = replace(each[0], energies=tuple(needs))
+    total = replace(each[0], energies=tuple(needs))
     violations = dict.fromkeys(said for one in each for said in one.timeline.violations)
-    if found.total_bytes * ROOM > found.free_bytes:
+    if total.total_bytes * ROOM > total.free_bytes:
         said = (
-            f"{len(each)} energies need {size(found.total_bytes)} and a tenth more, the disk has "
-            f"{size(found.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
+            f"{len(each)} energies need {size(total.total_bytes)} and a tenth more, the disk has "
+            f"{size(total.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
         )
         violations[said] = None
-    return replace(found, timeline=replace(found.timeline, violations=tuple(violations)))
+    return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
 
 def _worked(
@@ -171,8 +171,8 @@ def _worked(
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
     """With a violation where files in the folder cannot be locked."""
-    said = no_locks(folder)
-    return replace(worked, violations=(*worked.violations, said)) if said else worked
+    no_locking = no_locks(folder)
+    return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
 
 def refuse_violations(worked: Timeline) -> None:

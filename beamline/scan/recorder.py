@@ -204,10 +204,10 @@ class Recorder:
     @property
     def flags(self) -> dict[str, dict[str, int]]:
         """Frames flagged so far: their number by check, then by level."""
-        found: dict[str, dict[str, int]] = {}
+        flagged: dict[str, dict[str, int]] = {}
         for (check, level), frames in sorted(flagged_frames(self._found).items()):
-            found.setdefault(check, {})[str(level)] = len(frames)
-        return found
+            flagged.setdefault(check, {})[str(level)] = len(frames)
+        return flagged
 
     @property
     def drift(self) -> str:

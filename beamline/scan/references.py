@@ -32,8 +32,8 @@ class ReferenceLog:
         if frame.kind in REFERENCES:
             if frame.kind is not self._before:
                 self._groups.append([])
-            found = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block)
-            self._groups[-1].append(found)
+            reference = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block)
+            self._groups[-1].append(reference)
         elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
             self._views.append(ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block))
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
@@ -92,8 +92,8 @@ class ReferenceReport:
         """The faults of the darks and flats so far, as `ReferenceLog.faults`."""
         faults = log.faults(self._limits, planned)
         little_light = log.too_little_light(self._limits, self._exposure)
-        said = faults if little_light is None else {"little light": little_light, **faults}
-        for group in [group for group in said if group not in self._told]:
+        statements = faults if little_light is None else {"little light": little_light, **faults}
+        for group in [group for group in statements if group not in self._told]:
             self._told.add(group)
-            self._sink(Warned(said[group]))
+            self._sink(Warned(statements[group]))
         return faults

@@ -68,7 +68,7 @@ class ResumableRun:
     end_references: frozenset[FrameKind] | None = None
 
     @property
-    def said(self) -> str:
+    def in_words(self) -> str:
         """One line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
@@ -141,13 +141,13 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
 
 
 def _series(run: Path, given: Config | None) -> ResumableRun:
-    found, left_out = _files(run)
-    for part in found:
+    files, left_out = _files(run)
+    for part in files:
         if held(part):
             raise ConfigError(f"{part} is open in another process: a scan that still runs, or a reader. {_UNTOUCHED}")
     config = load(run / CONFIG, environment={})
     views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
-    for part in found:
+    for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             if layout.COMMITTED not in file:
                 raise DataError(f"{part} is no scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
@@ -198,8 +198,8 @@ def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN)
     before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
     differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
     if differ is not None or len(before) != len(now):
-        said = " `{}`, not `{}`,".format(*differ) if differ else ""
-        raise ConfigError(f"{run} was taken with another configuration:{said} in its {name}. {_UNTOUCHED}")
+        difference = " `{}`, not `{}`,".format(*differ) if differ else ""
+        raise ConfigError(f"{run} was taken with another configuration:{difference} in its {name}. {_UNTOUCHED}")
 
 
 def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> None:
@@ -208,9 +208,9 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
     if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
         raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
     devices = stored["/entry/instrument/devices"]
-    for device, said in ready.info.devices.items():
+    for device, description in ready.info.devices.items():
         group = hdf5.resolve(devices, device.replace("/", "_")) or {}
-        before, now = _identity({key: group[key][()] for key in group}), _identity(said)
+        before, now = _identity({key: group[key][()] for key in group}), _identity(description)
         if before != now:
             raise ConfigError(
                 f"{run} was taken with another {device}: {_words(before)}; now there is {_words(now)}. {_UNTOUCHED}"
@@ -219,23 +219,23 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
 
 def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
     """A sentence on each device that is not the one which the newest run in this folder found at the same port."""
-    found: list[str] = []
+    differing: list[str] = []
     with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
         files = sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)
         for path in files[-1:]:
             with hdf5.open_hdf5(path) as stored:
                 devices = stored["/entry/instrument/devices"]
-                for device, said in ready.info.devices.items():
+                for device, description in ready.info.devices.items():
                     group = hdf5.resolve(devices, device.replace("/", "_")) or {}
                     earlier = {key: hdf5.text(group[key][()]) for key in group}
-                    before, now = _identity(earlier), _identity(said)
-                    if "port" in said and earlier.get("port") == said["port"] and before != now:
-                        found.append(
-                            f"{device}: at {said['port']} there is {_words(now)}; in {path.parent.name}, the run "
-                            f"before, it was {_words(before)}. If cables or ports were swapped, stop the scan. "
+                    before, now = _identity(earlier), _identity(description)
+                    if "port" in description and earlier.get("port") == description["port"] and before != now:
+                        differing.append(
+                            f"{device}: at {description['port']} there is {_words(now)}; in {path.parent.name}, the "
+                            f"run before, it was {_words(before)}. If cables or ports were swapped, stop the scan. "
                             "devices.stage.serial refuses another device, where its controller tells a serial number."
                         )
-    return found
+    return differing
 
 
 def _identity(said: Mapping[str, Any]) -> dict[str, str]:
@@ -258,10 +258,10 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     Raises:
         DataError: no run, or a part that cannot be recovered; those before it are recovered.
     """
-    found, left_out = _files(run)
-    if not found:
+    files, left_out = _files(run)
+    if not files:
         raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
-    done = [recover(part, say) for part in found]
+    done = [recover(part, say) for part in files]
     if len(parts := [one.path for one in done if one.frames]) > 1:
         changed = not is_joined(run / JOINED)
         if changed:

@@ -129,9 +129,9 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             sink = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            for device, said in ready.info.devices.items():
-                if found := said.get(FOUND):
-                    sink(Warned(f"{device}: before it was opened: {found}."))
+            for device, description in ready.info.devices.items():
+                if found_settings := description.get(FOUND):
+                    sink(Warned(f"{device}: before it was opened: {found_settings}."))
             for sentence in others:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
@@ -185,7 +185,7 @@ class _Run:
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
         try:
-            self.states.enter(State.PREPARING, "Preparing" if self.series is None else self.series.said)
+            self.states.enter(State.PREPARING, "Preparing" if self.series is None else self.series.in_words)
             result = self._scan(live, release)
             if afterwards is not None:
                 result = self._reconstructed(afterwards, result)
@@ -251,10 +251,10 @@ class _Run:
         frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
         try:
             why = memory.prepare(n, self.ready.timing.shape)
-            said = f"{frames}, is ready" + (f"; the system may swap it out ({why})" if why else " and locked")
+            sentence = f"{frames}, is ready" + (f"; the system may swap it out ({why})" if why else " and locked")
         except OSError as error:
-            said = f"{frames}, cannot be had before they come ({error.strerror or error})"
-        self.sink(StateEntered(self.states.state, said[0].upper() + said[1:]))
+            sentence = f"{frames}, cannot be had before they come ({error.strerror or error})"
+        self.sink(StateEntered(self.states.state, sentence[0].upper() + sentence[1:]))
 
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
@@ -324,13 +324,13 @@ class _Run:
             return ()
         try:
             with open_scan(path) as source:
-                found = tuple(returned_views(source))
+                returned = tuple(returned_views(source))
         except (DataError, OSError, ValueError) as error:  # the scan is stored, whatever this says
             self.sink(Warned(f"Views on the way back could not be compared: {error}"))
             return ()
-        if moved := [view.said() for view in found if view.moved]:
+        if moved := [view.in_words() for view in returned if view.moved]:
             self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let it settle, fix it, or scan faster."))
-        return found
+        return returned
 
     def _acquire(
         self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None

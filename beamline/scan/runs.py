@@ -67,16 +67,16 @@ class Run:
 def runs_in(folder: Path) -> list[Path]:
     """The folders of runs in a folder, newest first; also those of the energies of a series in it."""
     within = [path for path in folder.glob("*/") if not is_below(path, EVENTS) and (path / CONFIG).is_file()]
-    found = [run for place in (folder, *within) for run in place.glob("*/") if is_below(run, EVENTS)]
-    return sorted(found, key=lambda run: (_began(run), _numbered(run)), reverse=True)
+    runs = [run for place in (folder, *within) for run in place.glob("*/") if is_below(run, EVENTS)]
+    return sorted(runs, key=lambda run: (_began(run), _numbered(run)), reverse=True)
 
 
 def newest(folder: Path) -> Path:
     """The running scan of a folder, or else its newest run. ConfigError if there is none."""
-    found = running(folder)[-1:] or runs_in(folder)
-    if not found:
+    candidates = running(folder)[-1:] or runs_in(folder)
+    if not candidates:
         raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
-    return found[0]
+    return candidates[0]
 
 
 def describe(run: Path) -> Run:
@@ -87,9 +87,9 @@ def describe(run: Path) -> Run:
     flags: dict[str, dict[str, int]] = {}
     state = ""
     for part in parts:
-        state, n, joined, found = _part(part)
+        state, n, joined, run_flags = _part(part)
         frames = n if joined or frames is None or n is None else frames + n
-        for check, levels in found.items():
+        for check, levels in run_flags.items():
             flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
     return Run(
         folder=run,
@@ -139,16 +139,16 @@ def _numbered(run: Path) -> tuple[int, str]:
 
 def _part(part: Path) -> tuple[str, int | None, bool, FlagCounts]:
     """State, frames, whether these are of all parts so far, and flags."""
-    said = _said(part)
-    done = said.get("done") or said.get("scan_done") or {}
-    state = str(said.get("state", {}).get("state", ""))
-    if not (state in _ENDED or "failed" in said):
+    last_events = _last_events(part)
+    done = last_events.get("done") or last_events.get("scan_done") or {}
+    state = str(last_events.get("state", {}).get("state", ""))
+    if not (state in _ENDED or "failed" in last_events):
         state = _unended(part, done)
     if (frames := _whole(done.get("n_frames"))) is not None:
         flags = done.get("flags")
         return state, frames, Path(str(done.get("path"))).name != SCAN, _flags(flags)
     if state != DIED and state not in _ENDED:  # it runs
-        return state, _whole(said.get("frame", {}).get("n")) or 0, False, {}
+        return state, _whole(last_events.get("frame", {}).get("n")) or 0, False, {}
     frames, flags = _of_file(part / SCAN)
     return state, frames, False, flags
 
@@ -193,18 +193,18 @@ def _head(part: Path) -> Mapping[str, Any]:
     return {}
 
 
-def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
+def _last_events(part: Path) -> Mapping[str, Mapping[str, Any]]:
     """The last event of each kind that tells the outcome of a part, from the end of its log."""
-    said: dict[str, Mapping[str, Any]] = {}
+    last_events: dict[str, Mapping[str, Any]] = {}
     with suppress(OSError), open_below(part, EVENTS) as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         for line in reversed(file.read(_TAIL).splitlines()):
-            kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in said)
+            kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in last_events)
             if (event := _event(line, kinds)) is not None and "source" not in event:  # an event of the live volume
-                said[event["event"]] = event
-            if said.keys() & {"done", "scan_done"} and "state" in said:
+                last_events[event["event"]] = event
+            if last_events.keys() & {"done", "scan_done"} and "state" in last_events:
                 break
-    return said
+    return last_events
 
 
 def _event(line: bytes, kinds: Iterable[str]) -> dict[str, Any] | None:
@@ -217,10 +217,10 @@ def _whole(value: object) -> int | None:
 
 
 def _flags(value: object) -> FlagCounts:
-    found = value if isinstance(value, dict) else {}
+    flags = value if isinstance(value, dict) else {}
     return {
         str(check): {str(level): n for level, n in levels.items() if isinstance(n, int)}
-        for check, levels in found.items()
+        for check, levels in flags.items()
         if isinstance(levels, dict)
     }
 

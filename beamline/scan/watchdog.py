@@ -165,8 +165,8 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
 
     def disarm() -> None:
         with closing(stage.connect(clock)) as connected:
-            if found := connected.describe().get(FOUND):
-                say(f"{connected.name}: {found}.")
+            if found_settings := connected.describe().get(FOUND):
+                say(f"{connected.name}: {found_settings}.")
             connected.disarm()
             if apart is None:
                 shutter_of(config, connected, clock, say).close()

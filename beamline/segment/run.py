@@ -104,22 +104,24 @@ def segment(options: SegmentOptions) -> Segmented:
         refuse_existing(path)
     volume, unit = _read(options)
     try:
-        found = _segmented(volume, unit, options)
+        segmented = _segmented(volume, unit, options)
     except ValueError as error:
         raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
     written = list[Path]()
     try:
         with whole_file(options.output) as partial:
-            _write_labels(partial, found, options)
+            _write_labels(partial, segmented, options)
         written.append(options.output)
-        write_whole(options.table, table_of(found))
+        write_whole(options.table, table_of(segmented))
         written.append(options.table)
-        write_whole(options.picture, picture_of(found.volume, found.unit, found.labels, found.particles))
+        write_whole(
+            options.picture, picture_of(segmented.volume, segmented.unit, segmented.labels, segmented.particles)
+        )
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)
         raise
-    return found
+    return segmented
 
 
 def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
@@ -130,17 +132,17 @@ def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
         box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
         volume = Volume(np.ascontiguousarray(volume.data[box]), volume.grid.part(*box))
     grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
-    found = clusters(grey, options.n_clusters, options.seed)
-    labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
+    greys = clusters(grey, options.n_clusters, options.seed)
+    labels = parted(cleaned(grey > greys.threshold, options.radius, options.smallest), options.neck)
     if options.margin is not None:
-        bright = whole > grey_at(volume.data, found.threshold, options.percentiles, options.gamma)
+        bright = whole > grey_at(volume.data, greys.threshold, options.percentiles, options.gamma)
         outside = bodies_outside(cleaned(bright, options.radius, options.smallest), box)
     particles, bars = measured(labels, volume.grid.spacing, volume.grid.first), None
     deviation = _deviation(options, box)
     if deviation is not None and deviation.shape == volume.data.shape:
         of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
-        bars = volume_deviation(labels, grey, of_grey, found.threshold) * np.prod(volume.grid.spacing)
-    return Segmented(box, volume, unit, labels, found, particles, bars, outside)
+        bars = volume_deviation(labels, grey, of_grey, greys.threshold) * np.prod(volume.grid.spacing)
+    return Segmented(box, volume, unit, labels, greys, particles, bars, outside)
 
 
 def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
@@ -148,8 +150,8 @@ def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
     if options.dataset not in (None, _SIGNAL) or not h5py.is_hdf5(options.volume):
         return None
     with hdf5.open_hdf5(options.volume) as file:
-        found = file.get(f"entry/data/{DEVIATION}")
-        return np.asarray(found[box], np.float32) if isinstance(found, h5py.Dataset) else None
+        deviation = file.get(f"entry/data/{DEVIATION}")
+        return np.asarray(deviation[box], np.float32) if isinstance(deviation, h5py.Dataset) else None
 
 
 def _read(options: SegmentOptions) -> tuple[Volume, str]:

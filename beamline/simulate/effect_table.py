@@ -46,14 +46,14 @@ def _default(field: Field[Any]) -> str:
 
 def _meanings(effect: type[Any]) -> dict[str, str]:
     """The section `Attributes` of a docstring by name; a line may describe several, and go on in the next one."""
-    known, found, names = {field.name for field in fields(effect)}, dict[str, str](), tuple[str, ...]()
+    known, meanings, names = {field.name for field in fields(effect)}, dict[str, str](), tuple[str, ...]()
     _, _, section = (inspect.getdoc(effect) or "").partition("\nAttributes:\n")
     for line in map(str.strip, section.splitlines()):
         head, colon, rest = line.partition(": ")
         named = tuple(name.strip() for name in head.split(","))
         if colon and known.issuperset(named):
             names = named
-            found |= dict.fromkeys(names, rest)
+            meanings |= dict.fromkeys(names, rest)
         else:
-            found |= {name: f"{found[name]} {line}".strip() for name in names}
-    return found
+            meanings |= {name: f"{meanings[name]} {line}".strip() for name in names}
+    return meanings

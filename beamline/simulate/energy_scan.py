@@ -168,13 +168,13 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
 
 def _charged(sample: Mixture, name: str, charge: float) -> Mixture:
     """The same with another state of charge of a material. ValueError: it has none."""
-    found = [
+    constituents = [
         replace(each, material=replace(each.material, state_of_charge=charge))
         if each.material is not None and each.material.name == name
         else each
         for each in sample.constituents
     ]
-    return replace(sample, constituents=tuple(found))
+    return replace(sample, constituents=tuple(constituents))
 
 
 def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> ContrastRegions:

@@ -25,7 +25,7 @@ from beamline.storage import hdf5
 from beamline.storage.codecs import filter_of
 from beamline.storage.parts import joined_file_of, other_parts, to_join
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.validate import altered_said
+from beamline.storage.rules.validate import altered_sentence
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 
@@ -85,9 +85,9 @@ def archive(
         DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan. The disk
             is full, or what was read back differs. Nothing is left of `out`, and the scan is untouched.
     """
-    frames, altered, said = _frames_of_archivable(scan)
+    frames, altered, damage = _frames_of_archivable(scan)
     if altered and not keep_damaged:
-        raise DataError(f"{said} To archive what there is: --keep-damaged. Nothing was written.")
+        raise DataError(f"{damage} To archive what there is: --keep-damaged. Nothing was written.")
     with whole_file(out) as partial, hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):
         datasets = _image_datasets(raw)
         count_image = _counter(progress, 2 * sum(dataset.nbytes for dataset in datasets))
@@ -120,21 +120,21 @@ def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
         frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))
-        said = altered_said(source) if altered else ""
+        damage = altered_sentence(source) if altered else ""
     if not finished or (head is not None and head.open_for_writing):
         raise DataError(
             f"{scan} is being written, or its writer died. Let the scan end, or run `beamline recover` first. Nothing "
             "was written."
         )
-    if (found := joined_file_of(scan)) is not None:
-        joined, n = found
+    if (joined_file := joined_file_of(scan)) is not None:
+        joined, n = joined_file
         raise DataError(f"{scan} is one of {n} parts of a scan. Archive all of it: {joined}. Nothing was written.")
     if others := other_parts(scan):
         raise DataError(
             f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
             f"{to_join(run_of(scan.resolve().parent))}; then archive joined.h5. Nothing was written."
         )
-    return frames, altered, said
+    return frames, altered, damage
 
 
 def _damaged(scan: Path, rows: set[int]) -> DataError:
@@ -256,13 +256,13 @@ class _CompressedCopy:
             fillvalue=source.fillvalue, **self._codec,
         )  # fmt: skip
         hdf5.copy_attributes(source, made)
-        said = _stored_checksums(source)
+        stored = _stored_checksums(source)
         checksums = self.checksums[source.name] = []
         for row, image in enumerate(_images(source)):
             made[row] = image
             self._require_taken()
             checksums.append(checksum_of(image))
-            if said is not None and not has_checksum(image, int(said[row])):
+            if stored is not None and not has_checksum(image, int(stored[row])):
                 self.damaged.add(row)
             self._count(image)
 
@@ -275,7 +275,7 @@ def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
     """
     names: list[str] = []
     raw.visit_links(names.append)  # an error within a visit would end h5py
-    found: dict[_Place, h5py.Dataset] = {}
+    datasets: dict[_Place, h5py.Dataset] = {}
     for name in ("/", *names):
         link = raw.get(name, getlink=True) if name != "/" else None
         item = raw[name] if link is None or isinstance(link, h5py.HardLink) else None
@@ -287,13 +287,13 @@ def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
         if item is not None and _is_image_dataset(item):
             if lost := hdf5.missing_links(item):
                 raise DataError(f"{raw.filename} draws its frames from {lost[0]}, which is not there or differs.")
-            found[_place(item)] = item
+            datasets[_place(item)] = item
         elif others := [link.filename] if isinstance(link, h5py.ExternalLink) else _kept_in(item):
             raise DataError(
                 f"{raw.filename} draws {name} from {others[0]} by a link; an archive would still need that file. "
                 "`beamline ingest` makes one file of both. Nothing was written."
             )
-    return [*found.values()]
+    return [*datasets.values()]
 
 
 def _is_image_dataset(item: h5py.HLObject) -> bool:

@@ -12,9 +12,9 @@ def filter_of(codec: str) -> Mapping[str, Any]:
     """The keywords of an HDF5 dataset that is compressed by a codec of these."""
     import hdf5plugin
 
-    found: Mapping[str, Any] = {
+    filters: Mapping[str, Any] = {
         "blosc2": hdf5plugin.Blosc2("zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE),
         "bitshuffle-zstd": hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
         "bitshuffle-lz4": hdf5plugin.Bitshuffle(cname="lz4"),
     }[codec]
-    return found
+    return filters

@@ -14,7 +14,7 @@ from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import BriefSource
 from beamline.storage.recon_record import ReconRecord
-from beamline.storage.rules.validate import altered_said, source_findings
+from beamline.storage.rules.validate import altered_sentence, source_findings
 from beamline.storage.volumes.files import times_of, volume_format
 from beamline.storage.writer_lock import held
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -96,7 +96,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
-        + ([altered_said(source)] if source.altered else []),
+        + ([altered_sentence(source)] if source.altered else []),
     }
 
 

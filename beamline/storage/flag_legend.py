@@ -169,12 +169,12 @@ class FrameFlags:
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Frames by check and level, for the checks and levels that flagged any; a frame counts by its worst level."""
-        found: dict[str, dict[str, int]] = {}
+        counted: dict[str, dict[str, int]] = {}
         for entry in self.legend:
             by_level = {level: self.rows(entry, level).size for level in (Level.WARN, Level.ALARM)}
             if any(by_level.values()):
-                found[entry.name] = {str(level): n for level, n in by_level.items() if n}
-        return found
+                counted[entry.name] = {str(level): n for level, n in by_level.items() if n}
+        return counted
 
 
 TODAY = tuple(FlagBit(check.name, check.bit, check.unit, check.meaning) for check in CHECKS)

@@ -149,9 +149,9 @@ def _refuse_truths(said: Any, key: str = "") -> None:
 
 def _image(root: Any) -> Mapping[str, Any]:
     """The first image of an OME-Zarr; {} without."""
-    said = root.attrs.get("ome", root.attrs)
-    found = said.get("multiscales", [{}])
-    return found[0]
+    attributes = root.attrs.get("ome", root.attrs)
+    multiscales = attributes.get("multiscales", [{}])
+    return multiscales[0]
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:

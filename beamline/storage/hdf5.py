@@ -19,7 +19,7 @@ import hdf5plugin  # noqa: F401 - registers the compressors that archived scans 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError, damaged, memory_limit_said, out_of_memory
+from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
 from beamline.core.files import leads_away, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
@@ -212,7 +212,7 @@ def readable(path: Path) -> Iterator[None]:
         yield
     except ALTERED as error:
         # HDF5 asks for too much memory where a file is damaged, too; without a limit that is why it gets none.
-        limit = memory_limit_said()
+        limit = memory_limit_sentence()
         no_memory = out_of_memory(error) and (limit or not damaged(error))
         if no_memory or isinstance(error, PermissionError | FileNotFoundError):
             raise
@@ -226,8 +226,8 @@ def readable(path: Path) -> Iterator[None]:
 
 def reason(error: Exception) -> str:
     """The reason of the disk or the system, in its own words, without HDF5's addresses and offsets."""
-    said = re.search(r"error message = '([^']*)'", str(error))
-    return said[1] if said else (isinstance(error, OSError) and error.strerror) or str(error)
+    message = re.search(r"error message = '([^']*)'", str(error))
+    return message[1] if message else (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 def never_close(file: h5py.File) -> None:

@@ -24,7 +24,7 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import altered_said, stated_used
+from beamline.storage.rules.validate import altered_sentence, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, state_ending
@@ -85,7 +85,7 @@ def ingest(
                 "as it is. Nothing was written."
             )
         if source.altered:
-            raise DataError(f"{altered_said(source)} Nothing was written.")
+            raise DataError(f"{altered_sentence(source)} Nothing was written.")
         if source.row_pitch_mm is not None:
             raise DataError(
                 f"{source.path} has pixels of {source.pixel_size_mm} x {source.row_pitch_mm:g} mm, and the copy states "

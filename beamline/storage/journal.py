@@ -170,8 +170,8 @@ def _changes(path: Path, journal: bytes) -> FileChanges | None:
         return None
     head, _, data = content.partition(b"\n")
     try:
-        said, ranges = json.loads(head), list[FileChange]()
-        length, numbers = said["length"], [tuple(each) for each in said["ranges"]]
+        header, ranges = json.loads(head), list[FileChange]()
+        length, numbers = header["length"], [tuple(each) for each in header["ranges"]]
         if not all(type(n) is int and 0 <= n < 2**63 for each in (*numbers, (length,)) for n in each):
             return None
         for at, n_old, n_new in numbers:

@@ -33,10 +33,10 @@ def read_mesh(path: Path) -> Reals:
     """
     try:
         require_regular(path, _LARGEST)
-        found = READERS[path.suffix.lower()](path.read_bytes())
-        if not np.isfinite(found).all():
+        triangles = READERS[path.suffix.lower()](path.read_bytes())
+        if not np.isfinite(triangles).all():
             raise ValueError("corners are not finite")
-        return found
+        return triangles
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise DataError(f"{path} cannot be read as a mesh of triangles: {error}. Nothing was written.") from error
 

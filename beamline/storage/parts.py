@@ -228,19 +228,19 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
         if not part.is_file():
             return f"its part {part} is not there"
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
-            found = int(file[layout.COMMITTED][()])
-            if found != n or _digest(file) != hdf5.text(digest):
-                return f"its part {part} has {found} frames that are not the {n} which it was made of"
+            committed = int(file[layout.COMMITTED][()])
+            if committed != n or _digest(file) != hdf5.text(digest):
+                return f"its part {part} has {committed} frames that are not the {n} which it was made of"
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
     return f"it lacks those of {others[0]}" if others else ""
 
 
 def _digest(part: h5py.File) -> str:
     """SHA-256 of the records of the frames: kind, angle, time, ..., and the checksum of their pixels."""
-    n, found = int(part[layout.COMMITTED][()]), hashlib.sha256()
+    n, hash_ = int(part[layout.COMMITTED][()]), hashlib.sha256()
     for path in layout.COLUMNS:
-        found.update(part[path][:n].tobytes())
-    return found.hexdigest()
+        hash_.update(part[path][:n].tobytes())
+    return hash_.hexdigest()
 
 
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:

@@ -150,16 +150,16 @@ def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
 
 
 def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
-    said = record.parameters
+    parameters = record.parameters
     frames, angles = (
-        np.atleast_1d(np.asarray(said.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
+        np.atleast_1d(np.asarray(parameters.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
     )
-    if not any(name in said for name in POSES_KEPT) or not frames.size:
+    if not any(name in parameters for name in POSES_KEPT) or not frames.size:
         raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
-    none, binning = np.zeros(frames.size), int(said.get("binning", 1))
-    shifts = np.asarray(said.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
-    turns = np.stack([np.asarray(said.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
-    axis = None if "columns" in said or "axis_col" not in said else float(said["axis_col"])
+    none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
+    shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
+    turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
+    axis = None if "columns" in parameters or "axis_col" not in parameters else float(parameters["axis_col"])
     return PoseTable(path, "frame", frames, angles, shifts, turns, axis_col=axis)
 
 
@@ -195,9 +195,11 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         raise _NoPosesError(
             f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV"
         )
-    said = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
+    directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:
-        raise _NoPosesError(f"{path}: the sample moves in {said}, and NeXus does not say where on the detector; {_HOW}")
+        raise _NoPosesError(
+            f"{path}: the sample moves in {directions}, and NeXus does not say where on the detector; {_HOW}"
+        )
     named = {way[-1] for way in ways} - {"0"}
     if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
         raise _NoPosesError(
@@ -220,9 +222,9 @@ def write_poses(path: Path, volume: Path) -> tuple[int, float]:
             table = _of_volume(volume, record)
         except ValueError as error:
             raise DataError(f"{error}. Nothing was written.") from error
-        said, mm = record.parameters, record.length_unit == "mm"
-        pixel = record.volume.grid.voxel_size if "sample_pitch" not in said else float(said["sample_pitch"])
-        pixel /= int(said.get("binning", 1))
+        parameters, mm = record.parameters, record.length_unit == "mm"
+        pixel = record.volume.grid.voxel_size if "sample_pitch" not in parameters else float(parameters["sample_pitch"])
+        pixel /= int(parameters.get("binning", 1))
     assert table.angles_deg is not None
     header = ["frame", "angle_deg", *_PIXELS, *_TURNS, *(_FOR_PEOPLE if mm else ())]
     columns = [table.angles_deg, *table.shifts.T, *table.turns_deg.T, *(table.shifts.T * pixel if mm else ())]
@@ -232,4 +234,4 @@ def write_poses(path: Path, volume: Path) -> tuple[int, float]:
     for frame, *values in zip(table.keys, *columns, strict=True):
         writer.writerow([int(frame), *(repr(float(value)) for value in values)])
     write_whole(path, text.getvalue())
-    return int(table.keys.size), float(said["axis_col"])
+    return int(table.keys.size), float(parameters["axis_col"])

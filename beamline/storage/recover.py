@@ -62,19 +62,19 @@ class Recovered:
     altered: tuple[int, ...] = ()
     remark: str = ""
 
-    def said(self) -> str:
+    def in_words(self) -> str:
         """The result as one line of text."""
         wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
-            said = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}; nothing was changed."
+            sentence = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}; nothing was changed."
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
             lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
             damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
             views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
-            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
-        return f"{said} {self.remark}".strip()
+            sentence = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
+        return f"{sentence} {self.remark}".strip()
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
@@ -344,7 +344,7 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
     """The last frames that differ from their checksum."""
     data, checksums = file[layout.DATA], file["/entry/digest/checksum"][()]
     first = max(0, len(data) - COMPARED // max(1, data.id.get_storage_size() // max(1, len(data))))
-    image, found = np.empty((1, *data.shape[1:]), data.dtype), []
+    image, damaged = np.empty((1, *data.shape[1:]), data.dtype), []
     for row in range(first, len(data)):
         try:
             hdf5.read_frames(data, np.array([row]), slice(None), image)
@@ -352,8 +352,8 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
         except DataError:
             whole = False
         if not whole:
-            found.append(row)
-    return tuple(found)
+            damaged.append(row)
+    return tuple(damaged)
 
 
 def _altered(file: h5py.File, frames: int) -> tuple[int, ...]:

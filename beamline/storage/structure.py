@@ -63,7 +63,7 @@ def _places(name: str, path: Path) -> Iterator[Path]:
 
 def _looked_at(file: h5py.File, path: Path) -> list[Path]:
     """The regular files that a file draws on; DataError where one is something else."""
-    found = dict[Path, None]()
+    files = dict[Path, None]()
     for name in dict.fromkeys(_names(file, path)):
         for place in _places(name, path):
             with suppress(ValueError):
@@ -75,8 +75,8 @@ def _looked_at(file: h5py.File, path: Path) -> list[Path]:
                     raise DataError(
                         f"{path} draws on {name}, which no scan does ({error.strerror}). Nothing was read."
                     ) from error
-                found[place] = None
-    return [*found]
+                files[place] = None
+    return [*files]
 
 
 def _names(file: h5py.File, path: Path) -> Iterator[str]:
@@ -149,10 +149,10 @@ def _is_text(path: Path) -> bool:
         require_regular(path)
         with path.open("rb") as file:
             head = file.read(_HEAD)
-        said = head.decode("utf-8") if len(head) < _HEAD else head[: head.rfind(b"\n") + 1].decode("utf-8")
+        text = head.decode("utf-8") if len(head) < _HEAD else head[: head.rfind(b"\n") + 1].decode("utf-8")
     except (OSError, UnicodeDecodeError):
         return False
-    return bool(said) and all(c.isprintable() or c.isspace() for c in said)
+    return bool(text) and all(c.isprintable() or c.isspace() for c in text)
 
 
 def _drawn_on(dataset: Any) -> Iterator[str]:

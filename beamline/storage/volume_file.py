@@ -218,13 +218,13 @@ def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tupl
 
 def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.generic]:
     if name is None:
-        found: dict[str, int] = {}
+        arrays: dict[str, int] = {}
         file.visititems(
             lambda key, item: (
-                found.update({key: item.ndim}) if isinstance(item, h5py.Dataset) and item.ndim == 3 else None
+                arrays.update({key: item.ndim}) if isinstance(item, h5py.Dataset) and item.ndim == 3 else None
             )
         )
-        name = _only(path, found)
+        name = _only(path, arrays)
     item = file.get(name)
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")

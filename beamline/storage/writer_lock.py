@@ -62,10 +62,10 @@ class LockFailure(Enum):
 
 def lock_failure(error: BaseException) -> LockFailure | None:
     """Whether an error of h5py says that a file could not be locked, and why; None: it is another error."""
-    said = re.search(r"unable to lock file, errno = (\d+)", str(error))
-    if said is None:
+    match = re.search(r"unable to lock file, errno = (\d+)", str(error))
+    if match is None:
         return None
-    return LockFailure.NO_LOCKS if int(said[1]) in _NONE else LockFailure.HELD
+    return LockFailure.NO_LOCKS if int(match[1]) in _NONE else LockFailure.HELD
 
 
 def no_locks(folder: Path) -> str:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from beamline.projections.scan_statistics import dose_scale
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.trials.table import TrialTable
 from beamline.trials.trial import Outcome, Trial
 from recon.methods import names
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _APART = 16.0  # pixels between two numbers on the same side of their points, at least
@@ -42,6 +44,8 @@ def pareto_plot(
         unit: of the cost.
         pick: number in `front` of the trial that is worth its cost, which gets a ring; None: of none.
     """
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH, 5.2 + 0.18 * len(front)), dpi=DPI, layout="constrained")
     axes: Axes = figure.subplots()
     shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
@@ -90,6 +94,8 @@ def pareto_plot(
 
 def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
     """The residual of each trial during its run, dB against s: solid for views held out, dashed for views used."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH, 4.0), dpi=DPI, layout="constrained")
     axes: Axes = figure.subplots()
     for outcome in outcomes:
@@ -113,6 +119,8 @@ def _size(group: str) -> float:
 
 def _scale(axes: Axes, costs: Sequence[float]) -> None:
     """Make the axis of costs logarithmic if they differ by more than a factor of four."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     if not costs or min(costs) <= 0 or max(costs) < 4 * min(costs):
         return
     axes.set_xscale("log")
@@ -150,6 +158,8 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
     Args:
         values: of a row, by the label of their axis.
     """
+    from matplotlib.figure import Figure
+
     rows = list(dict.fromkeys(outcome.trial.choice.label for outcome in table.compared if outcome.trial.choice))
     down = -(-len(values) // 2)
     height = 2.0 * down + 2.2
@@ -170,6 +180,8 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
 
 def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
     """A figure of all rows against dose and against time, a colour a method."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
     by_dose, by_time = figure.subplots(1, 2, sharey=True)
     a_frame, dose = dose_scale(table.light)

@@ -91,7 +91,7 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
     truth = None if truth_given is None else fit_truth(truth_given, grid, asked.selection.binning).data
     facts["volume"] = " × ".join(map(str, grid.shape))
     if light is not None:
-        facts["light"] = "; ".join(light.said())
+        facts["light"] = "; ".join(light.in_words())
     return OpenedScan(facts, prepared, grid, truth, light)
 
 

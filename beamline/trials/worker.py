@@ -233,10 +233,8 @@ def ended_in_time(
     on_progress: Callable[[recon.Progress], None] | None = None,
 ) -> RunControl:
     """The control of a reconstruction that begins now, and ends when the trial's seconds, if any, are over."""
-    if trial.seconds_asked is None:
-        return RunControl(on_progress=on_progress, now=now)
-    end = now() + trial.seconds_asked
-    return RunControl(should_stop=lambda: now() >= end, on_progress=on_progress, now=now)
+    control = RunControl(on_progress=on_progress, now=now)
+    return control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
 
 
 def reached(result: Reconstruction) -> str:

@@ -219,12 +219,12 @@ def _needed(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def _finite(path: Path, name: str, values: Any) -> Reals:
-    found = np.asarray(values, dtype=np.float64)
-    if not np.isfinite(found).all():
-        raise DataError(f"{path}: {name} is not a number at {int((~np.isfinite(found)).sum())} energies.")
-    if beyond := np.count_nonzero(np.abs(found) > _MOST):
+    numbers = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        raise DataError(f"{path}: {name} is not a number at {int((~np.isfinite(numbers)).sum())} energies.")
+    if beyond := np.count_nonzero(np.abs(numbers) > _MOST):
         raise DataError(f"{path}: {name} is beyond ±{_MOST:g} at {beyond} energies; expected a measured value.")
-    return found
+    return numbers
 
 
 def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:

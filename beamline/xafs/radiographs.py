@@ -68,10 +68,10 @@ def _mean(item: h5py.Dataset | None, part: FramePart) -> Reals:
 
 def _counts(values: Any) -> Reals:
     """NaN where integers are the largest of their type: the pixel may be saturated."""
-    found = np.asarray(values, dtype=np.float64)
+    counts = np.asarray(values, dtype=np.float64)
     if values.dtype.kind in "ui":
-        found[values == np.iinfo(values.dtype).max] = np.nan
-    return found
+        counts[values == np.iinfo(values.dtype).max] = np.nan
+    return counts
 
 
 def line_integrals(signal: Reals, flat: Reals) -> Reals:

@@ -7,16 +7,17 @@ import io
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from beamline.core.files import refuse_existing, write_whole
 from beamline.report.figures import png
 from beamline.xafs.contrast import XafsCurve
 from beamline.xafs.edge import AbsorptionEdge
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +38,10 @@ class XafsResult:
     @property
     def tabulated(self) -> str:
         """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
-        from beamline.xafs.tabulated import said_of  # lazily: it imports xraylib, which takes a while
+        from beamline.xafs.tabulated import edge_sentence  # lazily: it imports xraylib, which takes a while
 
         low, high = (float(end) for end in self.curve.energies[[0, -1]])
-        return said_of(self.material, self.elements, low, high, self.edge.energy)
+        return edge_sentence(self.material, self.elements, low, high, self.edge.energy)
 
     @property
     def criterion(self) -> str:
@@ -123,6 +124,8 @@ def table(curve: XafsCurve) -> str:
 
 def picture(result: XafsResult) -> bytes:
     """PNG: the absorption over energy with edge, white line and best energy, and the contrast-to-noise below."""
+    from matplotlib.figure import Figure
+
     curve, edge, cnr = result.curve, result.edge, result.curve.contrast_to_noise
     figure = Figure(figsize=(8.6, 3.4 if cnr is None else 5.4), dpi=110, layout="constrained")
     panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))

@@ -60,15 +60,15 @@ class ScanRadiographs:
 
 
 def _all(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
-    found = np.flatnonzero(source.image_key == kind)
-    if not found.size:
+    frames = np.flatnonzero(source.image_key == kind)
+    if not frames.size:
         raise DataError(f"{source.path} has no {kind.name.lower()}s. Nothing was written.")
-    return found
+    return frames
 
 
 def _chosen(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
-    found = _all(source, kind)
-    return found[np.unique(np.linspace(0, found.size - 1, _MOST_VIEWS).round().astype(int))]
+    frames = _all(source, kind)
+    return frames[np.unique(np.linspace(0, frames.size - 1, _MOST_VIEWS).round().astype(int))]
 
 
 def _frame(source: ScanSource, index: int, part: FramePart) -> Reals:

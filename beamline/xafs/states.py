@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 
 from beamline.report.figures import png
 from beamline.xafs.results import XafsResult
@@ -54,6 +52,9 @@ def table(states: Sequence[XafsResult]) -> str:
 
 def picture(states: Sequence[XafsResult]) -> bytes:
     """PNG: all curves over energy, and the edge (dashed) and the white line (dotted) of each in its colour."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8.6, 4.6), dpi=110, layout="constrained")
     axes = figure.subplots()
     shades = np.linspace(0, 0.9, len(states))

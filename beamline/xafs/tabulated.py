@@ -29,7 +29,7 @@ def nearest_edges(energy: float, elements: Sequence[int] = ()) -> list[Tabulated
     return [edge for shell in ("K", "L3") for edge in nearest([each for each in edges if each.shell == shell])]
 
 
-def said_of(material: str, elements: Sequence[int], low: float, high: float, edge: float | None) -> str:
+def edge_sentence(material: str, elements: Sequence[int], low: float, high: float, edge: float | None) -> str:
     """Which tabulated edge an edge that was found belongs to; or, without one, where the material has its own.
 
     Args:
@@ -46,9 +46,9 @@ def said_of(material: str, elements: Sequence[int], low: float, high: float, edg
     if not nearest:
         return f"{material} has no edge at all"
     where = _beside(nearest[0], low if nearest[0].energy < low else high)
-    said = f"{material} has no edge from {low:.4f} to {high:.4f} keV: its nearest is {where} the range"
+    sentence = f"{material} has no edge from {low:.4f} to {high:.4f} keV: its nearest is {where} the range"
     others = [each.named for each in _within(edges_of(range(1, HEAVIEST + 1)), low, high) if each.shell == "K"]
-    return f"{said}. In the range lies {', '.join(others)}, of an element that it lacks" if others else said
+    return f"{sentence}. In the range lies {', '.join(others)}, of an element that it lacks" if others else sentence
 
 
 def _within(edges: Sequence[TabulatedEdge], low: float, high: float) -> list[TabulatedEdge]:

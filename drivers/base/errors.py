@@ -33,7 +33,7 @@ class DeviceError(Exception):
     ) -> None:
         self.device, self.problem, self.request, self.reply = device, problem, request, reply
         self.expected, self.advice, self.state, self.wire = expected, advice, state, wire
-        said = (
+        formatted = (
             ("Asked {!r}", request),
             ("Answered {!r}", reply),
             ("Expected {}", expected),
@@ -41,7 +41,7 @@ class DeviceError(Exception):
             ("{}", state),
             ("On the wire: {}", wire),
         )
-        parts = [f"{device}: {problem}", *(form.format(text) for form, text in said if text)]
+        parts = [f"{device}: {problem}", *(form.format(text) for form, text in formatted if text)]
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:

@@ -221,10 +221,10 @@ class TextBeamMonitor:
         text = self._source.text()
         time = self._clock.now()
         match = self._pattern.search(text)
-        found = "" if match is None else match[1] or ""
-        if not _NUMBER.fullmatch(found):
+        number = "" if match is None else match[1] or ""
+        if not _NUMBER.fullmatch(number):
             raise self._error("the answer holds no number", text)
-        value = float(found)
+        value = float(number)
         if abs(value) >= OVERFLOW:
             raise self._error("the instrument is over range, or has no valid reading", text)
         return BeamReading(value * self._scale, self._unit, time)

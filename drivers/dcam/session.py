@@ -30,12 +30,12 @@ class Session:
         self._device = device
         self._steps: list[Callable[[], None]] = []  # close what was opened, in reverse order
         try:
-            found = self._start()
-            if index >= found:
+            cameras = self._start()
+            if index >= cameras:
                 raise DeviceError(
                     device,
                     f"there is no camera {index}",
-                    expected=f"an index below {found}, the number of cameras that DCAM found",
+                    expected=f"an index below {cameras}, the number of cameras that DCAM found",
                     advice="Correct the camera's index in the configuration",
                     state="Nothing was changed",
                 )

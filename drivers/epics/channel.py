@@ -138,13 +138,13 @@ class PvaChannel:
 
     def read(self, *suffixes: str) -> list[PvValue]:
         names = [self.name + suffix for suffix in suffixes]
-        found = self._asked().get(names, timeout=self._timeout, throw=False)
-        if silent := [name for name, value in zip(names, found, strict=True) if _is_silence(value)]:
+        values = self._asked().get(names, timeout=self._timeout, throw=False)
+        if silent := [name for name, value in zip(names, values, strict=True) if _is_silence(value)]:
             self._errors.silent(", ".join(silent))
-        for name, value in zip(names, found, strict=True):
+        for name, value in zip(names, values, strict=True):
             if isinstance(value, Exception):
                 self._errors.refused(name, value)
-        return [_of_pva(value) for value in found]
+        return [_of_pva(value) for value in values]
 
     def write(self, suffix: str, value: float | str) -> None:
         name = self.name + suffix
@@ -193,13 +193,13 @@ class CaChannel:
 
     def read(self, *suffixes: str) -> list[PvValue]:
         ca, names = self._asked(), [self.name + suffix for suffix in suffixes]
-        found = _waited(ca.caget(names, format=ca.FORMAT_CTRL, timeout=self._timeout, throw=False))
-        if silent := [value.name for value in found if not value.ok and value.errorcode in _CA_SILENCE]:
+        values = _waited(ca.caget(names, format=ca.FORMAT_CTRL, timeout=self._timeout, throw=False))
+        if silent := [value.name for value in values if not value.ok and value.errorcode in _CA_SILENCE]:
             self._errors.silent(", ".join(silent))
-        for value in found:
+        for value in values:
             if not value.ok:
                 self._errors.refused(value.name, value)
-        return [_of_ca(value) for value in found]
+        return [_of_ca(value) for value in values]
 
     def write(self, suffix: str, value: float | str) -> None:
         ca, name = self._asked(), self.name + suffix

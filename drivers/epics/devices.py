@@ -136,7 +136,7 @@ class PvFilter:
         self._check = check
 
     def place(self) -> str | None:
-        status = self._said()
+        status = self._status_now()
         return next((name for name, value in self._pvs.places.items() if status.is_one(value)), None)
 
     def put(self, place: str) -> None:
@@ -149,22 +149,22 @@ class PvFilter:
                 self.name,
                 f"it did not come to {place} within {self._pvs.travel:g} s",
                 request=f"{self._setter.name} = {value}",
-                reply=f"{self._status.name} is {self._said()}",
+                reply=f"{self._status.name} is {self._status_now()}",
                 expected=f"{value}",
                 advice="Look where it is, and whether this computer may write to it",
             )
 
     def remember_place(self) -> Callable[[], str]:
         """See `drivers.base.protocols.Rechecked`."""
-        before = self._said()
+        before = self._status_now()
 
         def moved() -> str:
-            now = self._said()
+            now = self._status_now()
             return "" if now.value == before.value else f"{self._status.name} was {before}, and is {now}"
 
         return moved
 
-    def _said(self) -> PvValue:
+    def _status_now(self) -> PvValue:
         return _valid(self._status, self.name)
 
 
@@ -216,12 +216,12 @@ class PvMonochromator:
         self._check = check
 
     def energy(self) -> float:
-        said = _valid(self._status, self.name)
+        status = _valid(self._status, self.name)
         try:
-            return float(said.value) / self._pvs.per_kev
+            return float(status.value) / self._pvs.per_kev
         except ValueError:
             raise DeviceError(
-                self.name, f"{self._status.name} is no number", reply=str(said), expected="an energy"
+                self.name, f"{self._status.name} is no number", reply=str(status), expected="an energy"
             ) from None
 
     def move_to(self, energy: float) -> None:
@@ -274,9 +274,9 @@ def _valid(channel: ProcessVariable, device: str) -> PvValue:
 
 
 def _channel(url: str, device: str, timeout: float, opened: ExitStack) -> ProcessVariable:
-    found = open_channel(url, device, timeout)
-    opened.callback(found.close)
-    return found
+    channel = open_channel(url, device, timeout)
+    opened.callback(channel.close)
+    return channel
 
 
 def _waited(arrived: Callable[[], bool], travel: float, clock: Clock, check: Callable[[], None] = lambda: None) -> bool:

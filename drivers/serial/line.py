@@ -155,15 +155,17 @@ class SerialLine:
                 self._refuse_second_reply(text, state)
             kind = DeviceTimeout if text is None else DeviceError
             if text is None:
-                problem, found = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
+                problem, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
                 advice = "Check power, cable and baud rate; the next request first brings the line into step again"
             elif isinstance(text, Damaged):
-                problem, found = f"the reply was damaged on the way: {text.why}", text.text
+                problem, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
-                problem, found = "the reply does not have the form it must have", text
+                problem, received = "the reply does not have the form it must have", text
                 advice = "The line may be disturbed, or the device may be another model"
-            raise self._error(kind, problem, request=request, reply=found, expected=meaning, advice=advice, state=state)
+            raise self._error(
+                kind, problem, request=request, reply=received, expected=meaning, advice=advice, state=state
+            )
 
     def close(self) -> None:
         """Close the port once a request of another thread has ended; calling again does nothing."""

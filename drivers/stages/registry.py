@@ -5,11 +5,10 @@ Adding a stage takes its folder `drivers/stages/<kind>` with a module `stage`, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 
-from drivers.plugins import plugins
 from drivers.stages.settings import StageDriver, with_keys
+from splatline.registry import Registry
 
 REGISTRY = {  # kind, as a configuration names it: class in the kind's module `stage`
     "pm16c": "PM16CStage",
@@ -17,8 +16,9 @@ REGISTRY = {  # kind, as a configuration names it: class in the kind's module `s
     "zaber": "ZaberStage",
     "epics": "EpicsStage",
 }
-STAGES: Mapping[str, StageDriver] = {
-    **{kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},
-    **plugins("stage", REGISTRY, with_keys),
-}
+STAGES: Registry[StageDriver] = Registry(
+    "stage",
+    {kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},
+    with_keys,
+)
 """Kind -> the driver."""

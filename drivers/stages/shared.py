@@ -91,8 +91,8 @@ FOUND = "found_at_opening"
 
 def found_at_opening(*sentences: str) -> dict[str, str]:
     """The entry of a description; none if all sentences are empty."""
-    said = "; ".join(filter(None, sentences))
-    return {FOUND: said} if said else {}
+    joined = "; ".join(filter(None, sentences))
+    return {FOUND: joined} if joined else {}
 
 
 def refuse_another(name: str, wanted: str | None, serial: str) -> None:

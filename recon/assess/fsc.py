@@ -119,16 +119,15 @@ def fourier_shell_correlation(
     width = 1 / float(max(n * edge for n, edge in zip(shape, edges, strict=True)))
     nyquist = float(min(0.5 / edge for n, edge in zip(shape, edges, strict=True) if n > 1))
     shells = max(1, int(np.floor(nyquist / width + 1e-9)))
-    a, b = (_spectrum(volume, mask) for volume in (first, second))
-    sums = _sums_of_shells(a, b, shape, edges, width, shells)
+    sums = _sums_of_shells(_spectrum(first, mask), _spectrum(second, mask), shape, edges, width, shells)
     power = np.sqrt(sums.first * sums.second)
     correlation = np.divide(sums.cross, power, out=np.full(shells + 1, np.nan), where=power > 0)
-    used = sums.ones > 0
+    used = sums.voxels > 0
     used[0] = False  # the mean was subtracted
     return ShellCorrelation(
         frequency=np.float64(width) * np.arange(shells + 1, dtype=np.float64)[used],
         correlation=np.clip(correlation[used], -1, 1),
-        independent=np.maximum(1.0, sums.ones[used] * _independent_share(mask)),
+        independent=np.maximum(1.0, sums.voxels[used] * _independent_share(mask)),
         nyquist=nyquist,
     )
 
@@ -139,7 +138,7 @@ class _Sums(NamedTuple):
     cross: F64
     first: F64
     second: F64
-    ones: F64
+    voxels: F64
 
 
 def _sums_of_shells(
@@ -169,7 +168,7 @@ def _sums_of_shells(
             (sums.cross, (x * y.conj()).real),
             (sums.first, np.abs(x) ** 2),
             (sums.second, np.abs(y) ** 2),
-            (sums.ones, np.ones(w.size)),
+            (sums.voxels, np.ones(w.size)),
         ):
             total += np.bincount(index, w * values, shells + 1)
     return sums

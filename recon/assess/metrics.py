@@ -140,13 +140,13 @@ def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
     c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
     means = []
     for across in range(3):
-        found = []
+        by_slice = []
         for first, second in zip(np.moveaxis(truth, across, 0), np.moveaxis(volume, across, 0), strict=True):
             x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
             covariance = ((x - x.mean()) * (y - y.mean())).mean()
             light = (2 * x.mean() * y.mean() + c1) / (x.mean() ** 2 + y.mean() ** 2 + c1)
-            found.append(light * (2 * covariance + c2) / (x.var() + y.var() + c2))
-        means.append(np.mean(found))
+            by_slice.append(light * (2 * covariance + c2) / (x.var() + y.var() + c2))
+        means.append(np.mean(by_slice))
     return float(np.mean(means))
 
 
@@ -301,12 +301,12 @@ def contrast(truth: Array, volume: Array) -> dict[str, float]:
     mean = float(volume[body].mean()) if body.any() else 0.0
     if not mean > 0:
         return {}
-    found = {"variation": float(volume[body].std()) / mean}
+    figures = {"variation": float(volume[body].std()) / mean}
     if hot.any():
-        found["recovery"] = (float(volume[hot].mean()) / mean - 1) / (float(truth[hot].mean()) / level - 1)
+        figures["recovery"] = (float(volume[hot].mean()) / mean - 1) / (float(truth[hot].mean()) / level - 1)
     if cold.any():
-        found["spillover"] = float(volume[cold].mean()) / mean
-    return found
+        figures["spillover"] = float(volume[cold].mean()) / mean
+    return figures
 
 
 @dataclass(frozen=True)

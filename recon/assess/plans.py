@@ -146,8 +146,8 @@ class Choice:
         Args:
             default_count: of Gaussians, for the unbinned volume.
         """
-        found = {self.counted: self.steps} if self.counted else {}
-        return found | ({"gaussians": max(1, round(self.share * default_count))} if self.is_gaussian_fit else {})
+        settings = {self.counted: self.steps} if self.counted else {}
+        return settings | ({"gaussians": max(1, round(self.share * default_count))} if self.is_gaussian_fit else {})
 
 
 def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collection[str] | None = None) -> list[Choice]:
@@ -187,8 +187,8 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
 def best_steps(method: str) -> int:
     """Steps of this method beyond which no measured curve gains: further steps follow the noise."""
-    found = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
-    return max(found, default=DEFAULT_STEPS)
+    best = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+    return max(best, default=DEFAULT_STEPS)
 
 
 def _longest(curve: QualityCurve, further: int, budget: float, speeds: Speeds) -> Choice | None:

@@ -85,8 +85,8 @@ def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
         seconds: time that the fit took.
         steps: number of its steps, over which the learning rates fell.
     """
-    found = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1 and curve.share > 0)
-    low, middle, high = (seconds * (factor - 1) for factor in (found[0], found[len(found) // 2], found[-1]))
+    factors = sorted(_further(curve, steps) for curve in CURVES if curve.binning == 1 and curve.share > 0)
+    low, middle, high = (seconds * (factor - 1) for factor in (factors[0], factors[len(factors) // 2], factors[-1]))
     return NextDecibel(middle, low, high, "volume")
 
 

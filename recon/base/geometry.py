@@ -338,8 +338,8 @@ class Geometry:
         off_middle = self.axis_row - (rows - 1) / 2
         keeps = self.is_cone or not self.is_straight
         axis_row = self.axis_row - start if keeps else off_middle + (stop - start - 1) / 2
-        found = replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
-        return replace(found, angles=_frozen(self.angles + start * self.skew)) if start * self.skew else found
+        cropped = replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
+        return replace(cropped, angles=_frozen(self.angles + start * self.skew)) if start * self.skew else cropped
 
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.

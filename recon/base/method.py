@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
@@ -22,6 +22,7 @@ from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
+from recon.base.stop import Stop
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Plain = str | int | float
@@ -96,7 +97,7 @@ class RunControl:
 
     Attributes:
         should_stop: asked between steps or iterations; True ends the reconstruction with the volume so far. Direct
-            methods do not ask.
+            methods do not ask. Any function, or a `Stop`; methods ask `stop`, which is always there.
         on_progress: called about ten times a second, after each iteration, or each sixteen slices of FBP.
         on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
@@ -113,6 +114,24 @@ class RunControl:
     now: Clock = time.perf_counter
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
+
+    @property
+    def stop(self) -> Stop:
+        """Whether to end with the volume so far."""
+        return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
+
+    @property
+    def stop_of_trials(self) -> Callable[[], bool]:
+        """Whether to end the trials."""
+        return self.stop_trials or self.stop
+
+    def by(self, deadline: float) -> RunControl:
+        """The same, which ends when the clock shows the deadline, at the latest."""
+        return replace(self, should_stop=self.stop.by(deadline, self.now))
+
+
+def _never() -> bool:
+    return False
 
 
 @dataclass(frozen=True, eq=False)

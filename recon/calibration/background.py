@@ -113,11 +113,11 @@ def learn_background(
     best.sweep(rounds * _SWEEPS)
     mean = levelled.beats(best, unseen, _MEAN_BETTER)
     best = levelled if mean else best
-    left, found, shape = best.errors(unseen), best.coefficients, geometry.detector_shape
-    middle = _surface(np.where(np.arange(len(TERMS)) < _MEAN, found, 0), 0.0, shape)
-    squares = [np.square(_surface(found, time, shape)).mean() for time in data.times]
+    left, coefficients, shape = best.errors(unseen), best.coefficients, geometry.detector_shape
+    middle = _surface(np.where(np.arange(len(TERMS)) < _MEAN, coefficients, 0), 0.0, shape)
+    squares = [np.square(_surface(coefficients, time, shape)).mean() for time in data.times]
     return LearntBackground(
-        coefficients=found, shape=shape, size=float(np.sqrt(np.mean(squares))), lowest=float(middle.min()),
+        coefficients=coefficients, shape=shape, size=float(np.sqrt(np.mean(squares))), lowest=float(middle.min()),
         highest=float(middle.max()), without=float(np.sqrt(without.mean())), left=float(np.sqrt(left.mean())),
         drift=drift, mean=mean,
     )  # fmt: skip
@@ -258,14 +258,14 @@ def _of_no_volume(views: _Views, progress: Callable[[int], object]) -> F64:
         left.append(views.without_volume(term))
     terms, whole = np.stack(left, -1), np.stack([views.flat(term) for term in views.terms], -1)
     data, known = views.without_volume(views.data), views.flat(np.ones_like(views.data))
-    weight, found = known, np.zeros(len(TERMS))
+    weight, solution = known, np.zeros(len(TERMS))
     for _ in range(_ROBUST):
         shares, combinations = _shares(terms.T @ (terms * weight[:, None]), whole.T @ (whole * weight[:, None]))
         kept = combinations[:, shares > _LEAST] / shares[shares > _LEAST] ** 0.5
-        found = kept @ (kept.T @ (terms.T @ (weight * data)))
-        off = np.abs(data - terms @ found)
+        solution = kept @ (kept.T @ (terms.T @ (weight * data)))
+        off = np.abs(data - terms @ solution)
         weight = known * (off <= _CLIPPED * median_deviation(off[known > 0]))
-    return np.asarray(found)
+    return np.asarray(solution)
 
 
 def _shares(left: F64, whole: F64) -> tuple[F64, F64]:
@@ -311,9 +311,9 @@ def _levelled(start: _Trial, unseen: _Views, progress: Callable[[int], object]) 
 def _fitted(image: F32, basis: F64, used: Mask) -> F64:
     """Robust least squares of an image [row, col] by columns of a basis [pixel, term], on the pixels used."""
     values, kept = image.ravel().astype(np.float64), used
-    found: F64 = np.zeros(basis.shape[1])
+    solution: F64 = np.zeros(basis.shape[1])
     for _ in range(_ROBUST):
-        found = np.asarray(np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0])
-        off = np.abs(values - basis @ found)
+        solution = np.asarray(np.linalg.lstsq(basis[kept], values[kept], rcond=None)[0])
+        off = np.abs(values - basis @ solution)
         kept = used & (off <= _CLIPPED * median_deviation(off[used]))
-    return np.asarray(found)
+    return np.asarray(solution)

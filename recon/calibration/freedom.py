@@ -73,9 +73,9 @@ class GeometryChange:
 def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
     """Shifts [view, 2] without the part that nobody can know, and their mean along the columns: the axis' part."""
     place = np.stack((np.ones_like(angles), np.cos(angles), np.sin(angles)), axis=1)
-    found = np.linalg.lstsq(place, shifts[:, 0], rcond=None)[0]
-    rest = np.stack((shifts[:, 0] - place @ found, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
-    return rest, float(found[0])
+    solution = np.linalg.lstsq(place, shifts[:, 0], rcond=None)[0]
+    rest = np.stack((shifts[:, 0] - place @ solution, shifts[:, 1] - shifts[:, 1].mean()), axis=1)
+    return rest, float(solution[0])
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
@@ -85,20 +85,20 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
         tilted: the derivative by tilt, a radian; None: not wanted.
     """
     across, down = -np.gradient(images, axis=1), -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
-    found: dict[str, F32] = {}
+    by_term: dict[str, F32] = {}
     if "axis" in terms:  # beside shifts, too: their mean then comes in one step
-        found["axis"] = across
+        by_term["axis"] = across
     if "shifts" in terms:
-        found |= {"col": across, "row": down}
+        by_term |= {"col": across, "row": down}
     rows, cols = geometry.detector_shape
     if "roll" in terms:
         u = np.arange(cols) - geometry.axis_col - geometry.shifts[:, :1]
         v = np.arange(rows) - geometry.axis_row - geometry.shifts[:, 1:]
         turned = across * v[:, None, :].astype(np.float32) - down * u[:, :, None].astype(np.float32)
-        found["roll"] = np.asarray(turned / edge_motion(geometry), np.float32)
+        by_term["roll"] = np.asarray(turned / edge_motion(geometry), np.float32)
     if tilted is not None:
-        found["tilt"] = np.asarray(tilted / edge_motion(geometry), np.float32)
-    return found
+        by_term["tilt"] = np.asarray(tilted / edge_motion(geometry), np.float32)
+    return by_term
 
 
 def edge_motion(geometry: Geometry) -> float:

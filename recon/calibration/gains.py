@@ -79,10 +79,10 @@ def learn_gains(
     if n < LEAST_VIEWS or cols < LEAST_COLS:
         raise ValueError(f"{n} views of {cols} columns are too few; {LEAST_VIEWS} of {LEAST_COLS} are needed")
     seen, unseen = split_views(geometry, _ONE_IN)
-    found, height = np.zeros((rows, cols), np.float32), _height(geometry)
+    gains, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start
     if not _stripes_seen(projections[:, busiest : busiest + height], geometry):
-        return LearntGains(found, 0.0, 0.0, False)
+        return LearntGains(gains, 0.0, 0.0, False)
     lowest = busiest % height - height * (busiest % height > 0)
     starts = sorted(range(lowest, rows, height), key=lambda at: at != busiest)
     without = left = np.zeros(1)
@@ -93,14 +93,14 @@ def learn_gains(
         band = _Band.of(projections, geometry, outer, measured)
         volume, pixels = band.learn(seen)
         own = slice(inner.start - outer.start, inner.stop - outer.start)
-        found[inner] = pixels[own]
+        gains[inner] = pixels[own]
         if done == 0:
             plain, _ = band.learn(seen, gains=False)
             none = np.zeros_like(pixels)
             without, left = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
             if not (beyond_chance(without - left, _SURE) and left.mean() < _BETTER * without.mean()):
-                return LearntGains(np.zeros_like(found), _root(without), _root(left), False)
-    return LearntGains(found, _root(without), _root(left), True)
+                return LearntGains(np.zeros_like(gains), _root(without), _root(left), False)
+    return LearntGains(gains, _root(without), _root(left), True)
 
 
 def gains_memory(geometry: Geometry) -> int:
@@ -149,7 +149,7 @@ class _Band:
         views = self.geometry.select(seen)
         projector = Projector(views, Grid.matching(self.geometry))
         weight = None if self.known is None else np.broadcast_to(self.known, projector.projection_shape).astype("f4")
-        decide, found, volume = Decisions(), np.zeros(self.data.shape[1:], np.float32), None
+        decide, gains_so_far, volume = Decisions(), np.zeros(self.data.shape[1:], np.float32), None
         data = self.data[seen]
         for at in range(_ROUNDS):
             method = FistaTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
@@ -157,9 +157,9 @@ class _Band:
             if gains and at + 1 < _ROUNDS:
                 left = ring_offsets(data - projector.forward(volume.data), self.geometry.axis_col) * self._told_apart()
                 data -= left
-                found += left
+                gains_so_far += left
         assert volume is not None
-        return volume, found
+        return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
         """[view] mean square that volume and gains leave of views held out, in some rows."""

@@ -179,11 +179,11 @@ def _solved(
         scale[name] = np.sqrt(typical / np.maximum(told, 1e-30))
 
     def back(images: F32) -> tuple[F32, dict[str, F64]]:
-        found = {}
+        values = {}
         for name, slope in free.items():
             each = np.einsum("vcr,vcr->v", slope, images).astype(np.float64)
-            found[name] = scale[name] * (each if scale[name].size > 1 else each.sum(keepdims=True))
-        return model.adjoint(images), found
+            values[name] = scale[name] * (each if scale[name].size > 1 else each.sum(keepdims=True))
+        return model.adjoint(images), values
 
     def dot(a: tuple[F32, dict[str, F64]]) -> float:
         return float(np.vdot(a[0], a[0])) + sum(float(v @ v) for v in a[1].values())

@@ -116,7 +116,7 @@ class LearntGeometry:
     before: float
     after: float
 
-    def said(self, binning: int = 1) -> str:
+    def in_words(self, binning: int = 1) -> str:
         """In a sentence, in pixels smaller by `binning`."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
@@ -170,9 +170,9 @@ def learn_geometry(
         done += 1
         progress(done, total)
 
-    found = geometry
+    learnt = geometry
     for factor, count in zip(factors, steps, strict=True):
-        small, data = found.binned(factor), bin_views(projections, factor)
+        small, data = learnt.binned(factor), bin_views(projections, factor)
         fit = JointFit.of(data, small, frozenset({"axis"}), _weights(known, factor, data))
         fit.step(_AXIS_ROUNDS, 0.0)
         if factor == factors[0] and "axis" in terms:
@@ -183,17 +183,17 @@ def learn_geometry(
         for _ in range(count):
             fit.step(_ROUNDS, _FARTHEST)
             tick()
-        found = GeometryChange.between(small, fit.geometry).scaled(factor).applied(found)
+        learnt = GeometryChange.between(small, fit.geometry).scaled(factor).applied(learnt)
     return _confirmed(
-        projections, geometry, GeometryChange.between(geometry, found).of(terms), known, factors[-1], tick
+        projections, geometry, GeometryChange.between(geometry, learnt).of(terms), known, factors[-1], tick
     )
 
 
 def _factors(rows: int, cols: int) -> list[int]:
     """Binning of the levels, from coarse to fine."""
     finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1  # a pixel is not needed for a hundredth of it
-    found = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
-    return found[-len(_STEPS) :] or [1]
+    factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
+    return factors[-len(_STEPS) :] or [1]
 
 
 def _weights(known: F32 | None, factor: int, data: F32) -> F32 | None:

@@ -10,10 +10,10 @@ The density begins at the mean of the box (published: at half of the highest, wh
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass
 from typing import ClassVar
 
+from recon.base.settings_check import check_settings
 from recon.fields.networks import Field, HashGrid, Waves
 from recon.fields.train import FieldMethod
 
@@ -34,10 +34,7 @@ class _HashField(FieldMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.levels is not None and not 1 <= operator.index(self.levels) <= 16:
-            raise ValueError(f"levels must be 1 to 16, got {self.levels}")
-        if not 8 <= operator.index(self.log2_table) <= 24:
-            raise ValueError(f"log2_table must be 8 to 24, got {self.log2_table}")
+        check_settings(self, whole={"levels": (1, 16), "log2_table": (8, 24)})
 
     def grid_of(self, across: int) -> HashGrid:
         to_voxels = 1 + max(0, math.ceil(math.log2(across / _COARSEST)))

@@ -72,7 +72,7 @@ class _Gather(torch.autograd.Function):
 
 def gather_in_torch(points: Tensor, table: Tensor, sides: NDArray[Any], firsts: NDArray[Any]) -> Tensor:
     """Features [..., levels * features] of points [..., 3], by torch with its own slopes."""
-    found = []
+    levels = []
     corners = torch.tensor([[(n >> k) & 1 for k in range(3)] for n in range(8)], device=points.device)
     primes = torch.tensor(hash_grid.PRIMES, device=points.device)
     for level, side in enumerate(sides.tolist()):
@@ -86,8 +86,8 @@ def gather_in_torch(points: Tensor, table: Tensor, sides: NDArray[Any], firsts: 
         else:
             mixed = corner * primes
             entry = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) & (size - 1)
-        found.append((weight[..., None] * table[first + entry]).sum(-2))
-    return torch.cat(found, -1)
+        levels.append((weight[..., None] * table[first + entry]).sum(-2))
+    return torch.cat(levels, -1)
 
 
 class Waves(nn.Module):

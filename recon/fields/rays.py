@@ -73,17 +73,17 @@ def drawn(rng: np.random.Generator, candidates: Mask, count: int, windows: int, 
     Args:
         candidates: [row, col]; windows fall anywhere. Without windows at most so many pixels as there are candidates.
     """
-    (rows, cols), found = candidates.shape, []
+    (rows, cols), places = candidates.shape, []
     free = candidates
     if windows:
         side = min(side, rows, cols)
         top, left = rng.integers(0, rows - side + 1, windows), rng.integers(0, cols - side + 1, windows)
         within = np.arange(side)
         at = (top[:, None, None] + within[:, None]) * cols + left[:, None, None] + within
-        found.append(at.ravel())
+        places.append(at.ravel())
         free = candidates.copy()
         free.reshape(-1)[at.ravel()] = False
     left_over = np.flatnonzero(free)
     if left_over.size > count:
         left_over = left_over[rng.integers(0, left_over.size, count)]
-    return np.concatenate((*found, left_over))
+    return np.concatenate((*places, left_over))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import operator
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
 from recon.fields.networks import Field
@@ -72,16 +72,12 @@ class FieldMethod(ABC):
     width: int = 32
 
     def __post_init__(self) -> None:
-        for name in ("steps", "rays", "width"):
-            if operator.index(getattr(self, name)) < 1:
-                raise ValueError(f"{name} must be 1 or more, got {getattr(self, name)}")
-        for name in ("rate", "highest"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        if self.samples is not None and operator.index(self.samples) < 2:
-            raise ValueError(f"samples must be 2 or more, got {self.samples}")
-        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
-            raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
+        check_settings(
+            self,
+            whole={"steps": 1, "rays": 1, "width": 1, "samples": 2},
+            least={"seconds": 0.0},
+            above={"rate": 0.0, "highest": 0.0},
+        )
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return fit_field(self, problem, control)
@@ -134,8 +130,8 @@ class _Views:
     grid: Grid
 
     def usable(self, view: int, foreground: bool) -> Mask:
-        found = np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
-        return found & (self.data[view] > 0) if foreground else found
+        usable = np.ones(self.data.shape[1:], bool) if self.weights is None else self.weights[view] > 0
+        return usable & (self.data[view] > 0) if foreground else usable
 
     def of(self, view: int, pixels: Places) -> tuple[F32, F32]:
         """Values and weights of pixels."""
@@ -246,7 +242,7 @@ class _Fit:
             if now() - reported > 0.1:
                 reported = now()
                 self._report(len(used))
-            if self.control.should_stop is not None and self.control.should_stop():
+            if self.control.stop():
                 break
             if method.early_stop and self.looks - self.best.look > _PATIENCE:
                 break
@@ -270,8 +266,8 @@ class _Fit:
         squares = 0.0
         for first in range(0, pixels.size, count):
             part = slice(first, first + count)
-            found = self._integrals(points[part], lengths[part])
-            loss = (self._tensor(weights[part]) * (found - self._tensor(values[part])) ** 2).sum() / pixels.size
+            integrals = self._integrals(points[part], lengths[part])
+            loss = (self._tensor(weights[part]) * (integrals - self._tensor(values[part])) ** 2).sum() / pixels.size
             loss.backward()
             squares += float(loss.detach())
         self.optimiser.step()
@@ -290,8 +286,8 @@ class _Fit:
     def _judges(self, kept: Places) -> list[tuple[int, Places]]:
         """Rays of views held out, the same at every look."""
         share = -(-_JUDGES // max(1, kept.size))
-        found = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
-        return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in found if pixels.size]
+        pixels_of_views = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
+        return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in pixels_of_views if pixels.size]
 
     @torch.no_grad()
     def _look(self, judges: list[tuple[int, Places]]) -> None:
@@ -301,8 +297,8 @@ class _Fit:
             for part in np.array_split(pixels, -(-pixels.size * self.samples // CHUNK)):
                 values, weights = self.views.of(view, part)
                 rays = rays_of(self.views.geometry, view, part, self.views.grid)
-                found = self._integrals(rays.samples(middles), rays.lengths).cpu().numpy()
-                left += float((weights * (found - values) ** 2).sum())
+                integrals = self._integrals(rays.samples(middles), rays.lengths).cpu().numpy()
+                left += float((weights * (integrals - values) ** 2).sum())
                 scale += float((weights * values**2).sum())
         self.held_out = math.sqrt(left / max(scale, 1e-30))
         self.looks += 1

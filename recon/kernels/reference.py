@@ -22,6 +22,7 @@ Losses follow below. Everything is plain torch, so autograd gives the gradients 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import product
 
 import torch
@@ -66,10 +67,7 @@ def covariances(scales: Tensor, quaternions: Tensor) -> Tensor:
 
 
 def project_view(
-    means: Tensor,  # [n, 3] mm, (x, y, z)
-    scales: Tensor,  # [n, 3] mm
-    quaternions: Tensor,  # [n, 4]
-    densities: Tensor,  # [n] 1/mm
+    parameters: Sequence[Tensor],
     geometry: Geometry,
     view: int,
     *,
@@ -77,7 +75,12 @@ def project_view(
     length: float = 0.0,  # mm, replaces μ if not 0: the uncorrected factor
     kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Tensor:
-    """Line integrals [row, col] of one view: every Gaussian on every pixel, not truncated."""
+    """Line integrals [row, col] of one view: every Gaussian on every pixel, not truncated.
+
+    Args:
+        parameters: means [n, 3] mm (x, y, z), standard deviations [n, 3] mm, quaternions [n, 4], densities [n] 1/mm.
+    """
+    means, scales, quaternions, densities = parameters
     in_view = means @ means.new_tensor(geometry.axes(view)).T  # along columns, rows and beam
     seen = in_front(means, geometry, view)
     rays = torch.zeros_like(seen) if exact is None or not geometry.is_cone else exact & seen

@@ -47,11 +47,16 @@ class Particles:
     def statistics(self) -> dict[str, float]:
         """Numbers of particles and of cut ones; mean and 10th, 50th and 90th percentile of the other diameters."""
         whole = self.diameter[~self.cut]
-        found = {"particles": float(self.label.size), "cut": float(self.cut.sum())}
+        statistics = {"particles": float(self.label.size), "cut": float(self.cut.sum())}
         if whole.size:
             d10, d50, d90 = np.percentile(whole, [10, 50, 90])
-            found |= {"mean_diameter": float(whole.mean()), "d10": float(d10), "d50": float(d50), "d90": float(d90)}
-        return found
+            statistics |= {
+                "mean_diameter": float(whole.mean()),
+                "d10": float(d10),
+                "d50": float(d50),
+                "d90": float(d90),
+            }
+        return statistics
 
 
 def ball(radius: int) -> Mask:
@@ -136,7 +141,7 @@ def measured(
         origin: centre of the first voxel (z, y, x).
     """
     counts = np.bincount(labels.ravel())
-    found = np.flatnonzero(counts[1:]) + 1
+    labels_present = np.flatnonzero(counts[1:]) + 1
     sums = np.zeros((counts.size, 3))
     for axis in range(3):
         # Per slice, so that no array of coordinates is as large as the volume.
@@ -147,9 +152,12 @@ def measured(
         labels[face] for axis in range(3) for face in ((slice(None),) * axis + (0,), (slice(None),) * axis + (-1,))
     ]
     touched = np.unique(np.concatenate([face.ravel() for face in faces]))
-    centroid = np.asarray(origin) + sums[found] / counts[found, None] * np.asarray(spacing)
+    centroid = np.asarray(origin) + sums[labels_present] / counts[labels_present, None] * np.asarray(spacing)
     return Particles(
-        found.astype(np.int32), counts[found] * np.float64(np.prod(spacing)), centroid, np.isin(found, touched)
+        labels_present.astype(np.int32),
+        counts[labels_present] * np.float64(np.prod(spacing)),
+        centroid,
+        np.isin(labels_present, touched),
     )
 
 
@@ -166,7 +174,7 @@ def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float
     Args:
         labels, grey, deviation: [z, y, x]; the particles are `grey` above `threshold`.
     """
-    found = []
+    deviations = []
     for number, box in enumerate(ndimage.find_objects(labels), 1):
         if box is None:
             continue
@@ -180,8 +188,10 @@ def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float
         together = (math.sqrt(2 * math.pi) * _TOGETHER) ** 3
         noise = together * float((moved * ndimage.gaussian_filter(moved, _TOGETHER)).sum())
         faces = sum(np.count_nonzero(np.diff(own, axis=axis)) for axis in range(3))
-        found.append(math.sqrt(noise + (_PLACED * 2 / 3 * faces) ** 2))  # a ball has 3/2 faces per unit of its surface
-    return np.array(found)
+        deviations.append(
+            math.sqrt(noise + (_PLACED * 2 / 3 * faces) ** 2)
+        )  # a ball has 3/2 faces per unit of its surface
+    return np.array(deviations)
 
 
 def _basins(inside: Mask) -> tuple[Labels, F32]:

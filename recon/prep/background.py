@@ -157,17 +157,17 @@ class AirSums:
                 left = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
                 error = float(left.sum() / count)
                 if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
-                    found = np.zeros((n_views, len(powers(HIGHEST))))
-                    found[:, some] = _solved(wide_g.sum(axis=1), wide_b.sum(axis=1))
-                    best = error, n, found
+                    coefficients = np.zeros((n_views, len(powers(HIGHEST))))
+                    coefficients[:, some] = _solved(wide_g.sum(axis=1), wide_b.sum(axis=1))
+                    best = error, n, coefficients
         if best is None:
             return None
-        error, n, found = best
+        error, n, coefficients = best
         terms = self._terms.reshape(-1, self._terms.shape[-1])
-        squares = np.einsum("vi,ij,vj", found, terms.T @ terms, found, optimize=True)
-        size, mean = float(np.sqrt(squares / (len(terms) * n_views))), terms @ found.mean(axis=0)
+        squares = np.einsum("vi,ij,vj", coefficients, terms.T @ terms, coefficients, optimize=True)
+        size, mean = float(np.sqrt(squares / (len(terms) * n_views))), terms @ coefficients.mean(axis=0)
         return Background(
-            order=n, coefficients=found, shape=self._shape, size=size, lowest=float(mean.min()),
+            order=n, coefficients=coefficients, shape=self._shape, size=size, lowest=float(mean.min()),
             highest=float(mean.max()), before=float(before) ** 0.5, after=max(error, 0.0) ** 0.5,
             air=float(share.mean()), level=float(totals[..., 1].sum() / count),
         )  # fmt: skip

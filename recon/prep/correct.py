@@ -157,9 +157,9 @@ class Correction:
         if self._waiting is None:
             return None
         waiting, before = self._waiting, self._before
-        found = self.line_integrals(None)
+        lines = self.line_integrals(None)
         self._waiting, self._before = waiting, before
-        return found
+        return lines
 
     @property
     def air_columns(self) -> tuple[int, int]:

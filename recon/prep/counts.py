@@ -68,10 +68,10 @@ class Counts:
         for name, allowed in (
             ("flat", (shape, shape[1:])), ("dark", ((), shape[1:])), ("variance", ((), shape[1:]))
         ):  # fmt: skip
-            found = np.shape(getattr(self, name))
-            if found not in allowed:
+            given = np.shape(getattr(self, name))
+            if given not in allowed:
                 raise ValueError(
-                    f"{name} has shape {found}, counts of shape {shape} take {' or '.join(map(str, allowed))}"
+                    f"{name} has shape {given}, counts of shape {shape} take {' or '.join(map(str, allowed))}"
                 )
         if not 0 < self.gain < np.inf:
             raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
@@ -168,9 +168,9 @@ def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
     """Photons expected in each pixel [row, col], above 0: counts smoothed where they show no detail, or all."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
     left = 1 - 0.75 / (np.pi * _SIGMA**2)  # of white noise's variance, in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
-    found = _smooth((n - mean) ** 2, _SPREAD) / left
+    variance = _smooth((n - mean) ** 2, _SPREAD) / left
     counting = _smooth(n + extra, _SPREAD)
-    detail = np.clip(1 - _DETAIL * counting / np.maximum(found, 1e-12), 0, 1)
+    detail = np.clip(1 - _DETAIL * counting / np.maximum(variance, 1e-12), 0, 1)
     return np.maximum(mean + detail * (n - mean), _FEWEST), np.maximum(mean, _FEWEST)
 
 

@@ -79,21 +79,23 @@ class DynamicFlats:
 
     def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
         """The weights by the pixels without sample; `w` if these are few, or do not fit."""
-        found: NDArray[Any] = w
+        weights: NDArray[Any] = w
         for _ in range(2):
-            left = integral + np.tensordot(found, self.components, axes=1)
+            left = integral + np.tensordot(weights, self.components, axes=1)
             smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
             at = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
             matrix = np.column_stack((self.components.reshape(len(self.components), -1)[:, at].T, np.ones(at.size)))
-            found = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[0]
-            found, level = found[:-1], found[-1]
-        left = integral + np.tensordot(found, self.components, axes=1) + np.float32(level)
+            weights = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[
+                0
+            ]
+            weights, level = weights[:-1], weights[-1]
+        left = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
         smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
         noise = float(np.median(np.abs(left - smooth)[air])) / _SMOOTHED
-        return found if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
+        return weights if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
 
 
 def find_dynamic_flats(
@@ -137,8 +139,8 @@ def search_memory(flats: int, pixels: int) -> int:
 
 def view_memory(flats: int, pixels: int) -> int:
     """Most bytes that the components take, with the weights of a view by them."""
-    found, samples = min(_MOST, flats), min(2 * pixels, 3 * _SAMPLED // 2)
-    return 4 * pixels * (4 * found + 14) + 8 * samples * (3 * found + 8)
+    components, samples = min(_MOST, flats), min(2 * pixels, 3 * _SAMPLED // 2)
+    return 4 * pixels * (4 * components + 14) + 8 * samples * (3 * components + 8)
 
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
@@ -159,8 +161,8 @@ def _components(samples: F64, rng: np.random.Generator) -> F64:
         drawn.append(np.linalg.eigvalsh(noise @ noise.T))
     limit = np.mean(drawn, axis=0) + 2 * np.std(drawn, axis=0)
     stands_out = (values > limit)[::-1]
-    found = int(np.argmin(np.append(stands_out, False)))
-    return vectors[:, ::-1].T[: min(found, _MOST)]
+    number = int(np.argmin(np.append(stands_out, False)))
+    return vectors[:, ::-1].T[: min(number, _MOST)]
 
 
 def _least_absolute(matrix: F64 | F32, target: F64 | F32) -> F64:

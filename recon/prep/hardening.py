@@ -98,9 +98,9 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     from scipy.optimize import least_squares  # half a second
 
     bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
-    found = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
-    hard, more, share = found.x
-    explained = 1 - float(np.mean(found.fun**2) / p.var())
+    solution = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))
+    hard, more, share = solution.x
+    explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
             f"thickness explains {max(explained, 0):.0%} of the line integrals, of one material it would be "

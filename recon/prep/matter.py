@@ -72,15 +72,15 @@ class TabulatedEdge:
 
 def edges_of(elements: Iterable[int]) -> list[TabulatedEdge]:
     """K and L edges of elements, by atomic number, rising."""
-    found = []
+    edges = []
     for z in elements:
         for shell, number in _SHELLS.items():
             try:
                 energy = float(xraylib.EdgeEnergy(z, number))
             except ValueError:  # the element has no such shell
                 continue
-            found.append(TabulatedEdge(xraylib.AtomicNumberToSymbol(z), shell, energy))
-    return sorted(found, key=lambda edge: edge.energy)
+            edges.append(TabulatedEdge(xraylib.AtomicNumberToSymbol(z), shell, energy))
+    return sorted(edges, key=lambda edge: edge.energy)
 
 
 def delta_beta(name: str, energy_kev: float) -> float:

@@ -89,12 +89,12 @@ def _slope(a: F64, b: F64, axis_col: float) -> tuple[float, float]:
     near = max(8.0, 0.05 * a.shape[1])
     for rows in np.array_split(np.arange(len(a)), max(n, 1)):
         try:
-            found = axis_from_pair(a[rows], b[rows], (axis_col - near, axis_col + near))
+            estimate = axis_from_pair(a[rows], b[rows], (axis_col - near, axis_col + near))
         except AxisError:
             continue
-        if found.confident:
+        if estimate.confident:
             heights.append(float(rows.mean()) - (len(a) - 1) / 2)
-            columns.append(found.value)
+            columns.append(estimate.value)
     h, c = np.array(heights), np.array(columns)
     for _ in range(2):
         if h.size < FEWEST_BANDS:

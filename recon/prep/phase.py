@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import config
 from scipy import fft
 
 from recon.base.arrays import F32
@@ -45,6 +44,8 @@ class Paganin:
 
     def retrieve(self, views: F32, floor: float) -> None:
         """Replace measured line integrals [view, row, col] by those of the sample, in place; `floor`: least light."""
+        from numba import config
+
         along = [(np.arange(n) / (2 * n)) ** 2 for n in views.shape[1:]]  # of the cosines of a mirrored frame
         f2 = along[0][:, None] + along[1]
         gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)

@@ -214,12 +214,12 @@ class WithoutRings:
     Attributes:
         data: float32 [view, row, col], line integrals.
         taken: float32 [row, col], mean removed part of a view.
-        said: a sentence about the removal.
+        sentence: a sentence about the removal.
     """
 
     data: F32
     taken: F32
-    said: str
+    sentence: str
 
 
 def remove_rings(

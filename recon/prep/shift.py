@@ -100,11 +100,11 @@ def _filled(view: NDArray[np.floating]) -> F64:
 def _nearest(a: F64, b: F64) -> tuple[float, float]:
     """Whole pixels down and across: displaced so far, `a` fits `b` best."""
     shape = [fft.next_fast_len(n + int(REACH * n) + 1, real=True) for n in a.shape]
-    found = np.zeros(shape)
+    correlation = np.zeros(shape)
     for axis in range(2):
         one, other = (fft.rfft2(np.gradient(view, axis=axis), shape) for view in (a, b))
-        found += fft.irfft2(other * one.conj(), shape)
+        correlation += fft.irfft2(other * one.conj(), shape)
     moves = [fft.fftfreq(n, 1 / n).round() for n in shape]
     near = np.outer(*(np.abs(move) <= REACH * n for move, n in zip(moves, a.shape, strict=True)))
-    row, col = np.unravel_index(int(np.where(near, found, -np.inf).argmax()), found.shape)
+    row, col = np.unravel_index(int(np.where(near, correlation, -np.inf).argmax()), correlation.shape)
     return float(moves[0][row]), float(moves[1][col])

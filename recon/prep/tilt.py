@@ -105,14 +105,14 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     splines = [CubicSpline(candidates, curve) for curve in curves]
     start = np.array([candidates[at], slope * step / far])
     every = np.arange(heights.size)
-    found = _descend(splines, heights, every, start)
+    line = _descend(splines, heights, every, start)
     spread = 0.0
     for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
         parts = np.array_split(every, count)
-        without = np.array([_descend(splines, heights, np.setdiff1d(every, part), found)[1] for part in parts])
+        without = np.array([_descend(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts])
         spread = max(spread, math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2))))
-    spread = math.hypot(spread, _scatter(splines, heights, found))
-    return TiltEstimate(math.atan(found[1]), spread / (1 + found[1] ** 2), float(found[0]))
+    spread = math.hypot(spread, _scatter(splines, heights, line))
+    return TiltEstimate(math.atan(line[1]), spread / (1 + line[1] ** 2), float(line[0]))
 
 
 def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:

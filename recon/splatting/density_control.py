@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.empirical import APART, GROWTH, LOST
+from recon.base.settings_check import check_settings
 
 _PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 
@@ -47,8 +48,7 @@ class DensityPolicy:
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
-        if self.rule not in get_args(Rule):
-            raise ValueError(f"rule must be one of {', '.join(get_args(Rule))}, got {self.rule!r}")
+        check_settings(self, choices={"rule": get_args(Rule)})
 
 
 @dataclass(frozen=True, eq=False)

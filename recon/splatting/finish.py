@@ -36,7 +36,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import Patches, PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.pnp_dct import pnp_dct
@@ -54,7 +54,7 @@ class _Watch:
         self._begin, self._trials, self.ended = control.now(), 0, False
 
     def asked(self) -> bool:
-        self.ended = self._control.should_stop is not None and self._control.should_stop()
+        self.ended = self._control.stop()
         return self.ended
 
     def trial(self) -> bool:
@@ -118,7 +118,7 @@ class _Planning:
         weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
-        patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
+        patches, tried = _patches(problem, weight, lambda: judge), self.tried
         tried.direct = judge.residuals(judge.start) if judge.direct else None
         tried.smooth = judge.of_weight(weight)
         if patches.better:
@@ -161,6 +161,13 @@ class _Planning:
         taken = 0.0 if other is None else math.sqrt(np.mean(np.square(other, dtype=np.float64)))
         self.apart = taken > residuals.mean() and not is_coarse(seen.geometry, seen.grid)
         return None if trial.ended else residuals
+
+
+def _patches(problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None]) -> Patches:
+    """`choose_patches`; none where voxels are coarse, and without a search: they are never better there."""
+    if is_coarse(problem.projector.geometry, problem.projector.grid):
+        return Patches(0.0, False)
+    return choose_patches(problem, weight, trial)
 
 
 def _middle_of(volume: F32, shape: tuple[int, int, int]) -> F32:
@@ -231,27 +238,33 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
-    if watch.ended or "strength" not in decide.made:
-        return Candidates()
     tried = method.tried
+    if watch.ended or tried.smooth is None:
+        return Candidates()
     fits = tried.fit is not None and tried.by_voxels is not None and tried.fit.mean() < tried.by_voxels.mean()
     return replace(tried, prior={} if fits and method.apart else prior_decisions(decide.made))
 
 
 @dataclass
 class _Finish:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow."""
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow.
+
+    `share`: of the prior that views held out choose.
+    """
 
     iterations: int
     patches: bool
+    share: float
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
-            patches = choose_patches(problem, weight, trial)
+            patches = _patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
-        return refine(problem, x, weight, strength, self.iterations, PnpDct().iterations)
+        if not isinstance(weight, NoiseBalance):
+            weight *= self.share
+        return refine(problem, x, weight, self.share * strength, self.iterations, PnpDct().iterations)
 
 
 class Finished(NamedTuple):
@@ -269,6 +282,7 @@ def finish(
     settings: FitSettings | None = None,
     control: RunControl | None = None,
     nonnegative: bool = True,
+    share: float = 1.0,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -282,12 +296,13 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, and the weights of their rays.
-        sweeps: of total variation, 1 or more; None: 8, and steps with sparse patches where these predict views held out
-            better.
+        sweeps: of total variation, 1 or more; None: 8 times `share`, and steps with sparse patches where these predict
+            views held out better.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. Its decisions may
             hold the prior, see `judged`.
         nonnegative: voxels below zero are clipped.
+        share: of the prior that views held out choose from FBP, see `settings.share_of_prior`.
 
     Raises:
         ValueError: for shapes that disagree, or no sweeps.
@@ -302,9 +317,9 @@ def finish(
     beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views), FINISH_SWEEPS if sweeps is None else sweeps
+    watch, count = _Watch(control, problem.geometry.n_views), sweeps or max(1, round(share * FINISH_SWEEPS))
     refined = solve(
-        _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
+        _Finish(count, sweeps is None, share), projector, data, weight=weights, start=start, nonnegative=nonnegative,
         watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)

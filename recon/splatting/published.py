@@ -29,8 +29,8 @@ def published_fit() -> FitSettings:
     )  # fmt: skip
     return FitSettings(
         loss="l1", ssim_weight=0.25, tv_weight=0.05, tv_size=32, tv_moves=False, rates=(2e-4, 5e-3, 1e-3, 1e-2),
-        pace=1.0, decay=0.1, policy=policy, truncation=Truncation(sigmas=3.0), smallest=0.128, views_per_step=1,
-        kernel=Kernel.GAUSSIAN, joined_pixels=1,
+        pace=1.0, paced_for=_STEPS, decay=0.1, policy=policy, truncation=Truncation(sigmas=3.0), smallest=0.128,
+        views_per_step=1, kernel=Kernel.GAUSSIAN, joined_pixels=1,
     )  # fmt: skip
 
 

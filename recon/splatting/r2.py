@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self, get_args
@@ -16,6 +15,7 @@ from recon.base.choices import Quality
 from recon.base.empirical import DEFAULT_STEPS, FINISH_SWEEPS, MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
@@ -78,14 +78,8 @@ class R2:
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
-        if self.start not in get_args(Start):
-            raise ValueError(f"start must be one of {', '.join(get_args(Start))}, got {self.start!r}")
-        if self.steps is not None and operator.index(self.steps) < 0:
-            raise ValueError(f"steps must be 0 or more, got {self.steps}")
-        if self.finish is not None and operator.index(self.finish) < 0:
-            raise ValueError(f"finish must be 0 sweeps or more, got {self.finish}")
-        if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
-            raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
+        choices = {"start": get_args(Start)}
+        check_settings(self, whole={"steps": 0, "finish": 0}, least={"seconds": 0.0}, choices=choices)
 
     @property
     def planned_steps(self) -> int | None:
@@ -155,8 +149,7 @@ class R2:
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         preset = PRESETS[quality]
         count = max(1, round(preset.share * default_count))
-        slower = min(1.0, math.sqrt((self.planned_steps or DEFAULT_STEPS) / preset.steps))  # rates of a longer fit
-        return replace(self, steps=preset.steps, gaussians=count, fit=replace(self.fit, pace=slower * self.fit.pace))
+        return replace(self, steps=preset.steps, gaussians=count)
 
     def toy(self) -> Self:
         policy = None if self.fit.policy is None else DensityPolicy(start=0, every=1, threshold=0.0)

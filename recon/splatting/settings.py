@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from recon.base.choices import KERNEL
 from recon.base.empirical import (
+    DEFAULT_STEPS,
     NARROWEST,
     PACE,
     TV_CHANGE,
@@ -19,6 +20,7 @@ from recon.base.empirical import (
 )
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
@@ -37,7 +39,8 @@ class FitSettings:
         ssim_weight: of 1 - SSIM beside it.
         tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
             times the density unit). That is divided by the pixels of a Gaussian. Where matter changes by more than 0.16
-            of the density unit a voxel, it falls with the square of this change. It is kept between 0.02 and 0.25.
+            of the density unit a voxel, it falls with the square of this change. It is at most 0.25.
+        tv_least: the least of these weights, in a fit of `paced_for` steps; more steps need less, see `in_steps`.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
         tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
@@ -45,7 +48,9 @@ class FitSettings:
             dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
-            26 times as fast, with two views a step, gains 1 to 4 dB there (see docs/notes/exploration.md).
+            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
+            higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
+        paced_for: steps of the longest fit that `pace` holds for, see `in_steps`.
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.
@@ -60,10 +65,12 @@ class FitSettings:
     loss: Loss = "l1"
     ssim_weight: float = 0.25
     tv_weight: float | None = None
+    tv_least: float = TV_LEAST
     tv_size: int | None = None
     tv_moves: bool = True
     rates: tuple[float, float, float, float] = (2e-4, 5e-3, 1e-3, 1e-2)
     pace: float = PACE
+    paced_for: int = DEFAULT_STEPS
     decay: float = 0.1
     policy: DensityPolicy | None = field(default_factory=DensityPolicy)
     truncation: Truncation = field(default_factory=Truncation)
@@ -75,23 +82,35 @@ class FitSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
-        for name in ("views_per_step", "joined_pixels", "tv_size"):
-            value = getattr(self, name)
-            if value is None and name != "views_per_step":
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
-        for name in ("ssim_weight", "tv_weight"):
-            weight = getattr(self, name)
-            if weight is not None and not 0 <= weight < math.inf:
-                raise ValueError(f"{name} must be finite and 0 or more, got {getattr(self, name)}")
-        for name in ("pace", "decay", "smallest"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+        check_settings(
+            self,
+            whole=dict.fromkeys(("views_per_step", "joined_pixels", "tv_size", "paced_for"), 1),
+            least=dict.fromkeys(("ssim_weight", "tv_weight", "tv_least"), 0.0),
+            above=dict.fromkeys(("pace", "decay", "smallest"), 0.0),
+        )
         if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
             raise ValueError(
                 f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"
             )
+
+
+def in_steps(settings: FitSettings, steps: float) -> FitSettings:
+    """The settings of a fit of so many steps, where these are more than `paced_for`.
+
+    Its rates fall with their square root. The least weight of total variation, which a short fit needs to be smooth,
+    falls with the steps.
+    """
+    share = share_of_prior(settings, steps)
+    return replace(settings, pace=share * settings.pace, tv_least=share**2 * settings.tv_least)
+
+
+def share_of_prior(settings: FitSettings, steps: float) -> float:
+    """The share of its prior, and of its sweeps, that the finish of so long a fit keeps where voxels are coarse.
+
+    Views held out choose the prior for volumes that begin at FBP, and too heavy where voxels are coarse. A longer fit
+    has explained more, and a whole finish takes it away: 3.8 dB of a teapot after 1600 steps (docs/choosing.md).
+    """
+    return min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
 
 
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
@@ -101,7 +120,7 @@ def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:
     rows, cols = problem.geometry.detector_shape
     pixels = problem.geometry.n_views * rows * cols / count
     sharp = max(problem.change / TV_CHANGE, 1.0)
-    return min(max(TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, TV_LEAST), TV_MOST)
+    return min(max(TV_OF_NOISE * (problem.noise / sharp) ** 2 / pixels, settings.tv_least), TV_MOST)
 
 
 def tv_size(settings: FitSettings, grid: Grid) -> int:

@@ -57,9 +57,7 @@ def project(
             exact = None
             if chosen.is_cone and rays.exact_above < math.inf:
                 exact = reference.affine_error(*parameters[:3], chosen, view, g.kernel) > rays.exact_above
-            images.append(
-                reference.project_view(*parameters, chosen, view, exact=exact, length=length, kernel=g.kernel)
-            )
+            images.append(reference.project_view(parameters, chosen, view, exact=exact, length=length, kernel=g.kernel))
         return torch.stack(images)
     cut = truncation or Truncation()
     return Project.apply(*_raw(g, which), chosen, (_faint(cut, g, chosen), cut.sigmas, rays))

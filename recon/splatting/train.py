@@ -47,8 +47,9 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
-from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
+from recon.splatting.settings import FitSettings, growth, in_steps, share_of_prior, tv_size, tv_weight
 from recon.splatting.splat import voxelize
+from recon.voxels.held_out import is_coarse
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
@@ -224,11 +225,12 @@ class _Run:
     fitting: FitProblem
     tracker: _HeldOutTracker
     length: _Length
+    settings: FitSettings
     history: list[Progress] = field(default_factory=list)
 
     @property
     def stopped(self) -> bool:
-        return self.control.should_stop is not None and self.control.should_stop()
+        return self.control.stop()
 
     def model(self) -> tuple[Volume, Gaussians]:
         """The volume of the Gaussians, and these, turned as the rows see them."""
@@ -279,7 +281,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
         volume, made_by = _of_voxels(run, at)
     elif at == fit_at:
         volume, sweeps = _finished(run, volume, model)
-    settings, state = method.fit, run.state
+    settings, state = run.settings, run.state
     record = {
         **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": tuple(problem.use.held_out),
@@ -333,7 +335,9 @@ def _started(
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     planned = method.finish_sweeps == 0 or method.seconds is None
     length = _Length(method.planned_steps, seconds, method.finish, True, planned)
-    return _Run(method, problem, control, decide, views, begin, end, state, fitting, tracker, length)
+    if length.steps is not None:
+        settings = in_steps(settings, length.steps)
+    return _Run(method, problem, control, decide, views, begin, end, state, fitting, tracker, length, settings)
 
 
 def _steps(run: _Run) -> None:
@@ -345,12 +349,16 @@ def _steps(run: _Run) -> None:
         spent = now() - begin
         if done and (run.stopped or (length.seconds is not None and spent >= length.seconds)):
             break
-        fit.step(state, run.fitting, method.fit, length.fraction(state.step, spent))
+        fit.step(state, run.fitting, run.settings, length.fraction(state.step, spent))
         done += 1
-        if not length.planned and done == _TIMED and length.seconds is not None:
+        if done >= _TIMED and length.seconds is not None:
             spent = now() - begin
             remaining, step = length.seconds - spent, spent / done
-            length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
+            if not length.planned and done == _TIMED:
+                length.plan(FinishPlan(*run.decide("finish", partial(_finish_in_time, run, remaining, step))), spent)
+            if step > 0:  # the first steps are slower than the others, so that this is learnt as they come
+                expected = state.step + max(0.0, length.seconds - spent) / step
+                run.settings = in_steps(method.fit, min(expected, length.steps or expected))
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             run.tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
@@ -384,10 +392,12 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
         return volume, 0
     control = replace(run.control, decide=run.decide)
     if method.seconds is not None:
-        control = replace(control, should_stop=_until(control, run.end))
+        control = control.by(run.end)
     control = replace(control, stop_trials=None if length.trials else lambda: True)
+    coarse = is_coarse(run.views.fitted.geometry, volume.grid)
+    share = share_of_prior(method.fit, run.state.step) if coarse else 1.0
     finished, sweeps = finish(
-        volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative
+        volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative, share
     )  # fmt: skip
     if kept_back.size:
         views = run.views.all_geometry.select(kept_back)
@@ -428,11 +438,6 @@ def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
     geometry = run.views.fitted.geometry.at_row(0)
     plan = finish_within(room, remaining - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
     return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
-
-
-def _until(control: RunControl, end: float) -> Callable[[], bool]:
-    """Stops with `control`, or when its clock shows `end`."""
-    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
 def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:

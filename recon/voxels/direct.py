@@ -16,6 +16,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
@@ -146,8 +147,7 @@ class Fbp:
     filter: Filter = "hann"
 
     def __post_init__(self) -> None:
-        if self.filter not in get_args(Filter):
-            raise ValueError(f"filter must be one of {', '.join(get_args(Filter))}, got {self.filter!r}")
+        check_settings(self, choices={"filter": get_args(Filter)})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]

@@ -25,6 +25,7 @@ from recon.base.slabs import bands_of, slices_of
 from recon.base.volume import Grid
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
+from splatline.registry import unknown
 
 _VIEWS = 32  # filtered at a time
 _EDGE = 3  # columns at least, whose mean is the level at an edge
@@ -74,7 +75,7 @@ def filter_projections(
 
 def _known(filter: str) -> None:
     if filter not in get_args(Filter):
-        raise ValueError(f"unknown filter {filter!r}; use one of {', '.join(get_args(Filter))}")
+        raise ValueError(unknown("filter", filter, get_args(Filter)))
 
 
 def edge_levels(projections: F32) -> dict[float, F32]:

@@ -147,7 +147,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         history.append(Progress(iteration, planned, seconds, residual, residual, 0, geometry.n_views))
         if control.on_progress is not None:
             control.on_progress(history[-1])
-        return control.should_stop is not None and control.should_stop()
+        return control.stop()
 
     filled, known = masked(problem.projections, problem.use.weights)
     decide = control.decide or Decisions(problem.seed)
@@ -155,7 +155,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     volume = solve(
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        watch=Watch(report, control.stop_trials or control.should_stop or _silent), decide=decide,
+        watch=Watch(report, control.stop_of_trials), decide=decide,
     )  # fmt: skip
     return Reconstruction(volume, {**settings, "seed": problem.seed}, tuple(history))
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 
 class Domain(IntEnum):
@@ -133,7 +133,7 @@ def _entry_of(effect: type[Any]) -> EffectRow:
     return EffectRow(Domain(effect.domain), summary, follows, getattr(effect, "reason", "its package says so"))
 
 
-_PLUGGED: Mapping[str, type[Any]] = plugins("effect", _OURS, _fitting)
+_PLUGGED: Registry[type[Any]] = Registry("effect", {}, _fitting, reserved=_OURS)
 CATALOGUE: Mapping[str, EffectRow] = MappingProxyType(
     {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()}}
 )

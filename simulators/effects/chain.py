@@ -140,12 +140,12 @@ class Chain:
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:
         """The anomalies of a frame. The region of an anomaly that turns with the sample covers the whole exposure."""
-        found: dict[tuple[str, int], Label] = {}
+        labels: dict[tuple[str, int], Label] = {}
         for effect in self.effects:
             if isinstance(effect, Anomaly):
                 depth = effect.domain == Domain.OPTICAL_DEPTH and self.moves and shot.beam and shot.sample
                 moments = [shot.later(float(times[0])) for times in self.moments(shot).times] if depth else [shot]
                 for label in (label for moment in moments for label in effect.labels(moment)):
                     key = label.kind, label.which
-                    found[key] = found.get(key, label).joined(label)
-        return tuple(found.values())
+                    labels[key] = labels.get(key, label).joined(label)
+        return tuple(labels.values())

@@ -22,6 +22,8 @@ from pydantic import (
     create_model,
 )
 
+from splatline.registry import unknown
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from pydantic_core import ErrorDetails
@@ -60,7 +62,7 @@ def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[st
     """The kind that an entry names and the rest of its keys: a bare name, or a mapping with a `kind`."""
     kind = entry.get("kind") if isinstance(entry, Mapping) else entry
     if not isinstance(kind, str) or kind not in legal:
-        raise SceneError(f"{where}: kind {kind!r} is unknown; legal: {', '.join(legal)}")
+        raise SceneError(f"{where}: {unknown('kind', kind, legal)}")
     rest = {key: value for key, value in entry.items() if key != "kind"} if isinstance(entry, Mapping) else {}
     return kind, rest
 
@@ -134,8 +136,8 @@ def _checked_dataclass(cls: Any) -> Any:
 def _check_keys(legal: Sequence[str], needed: Sequence[str], mapping: Any) -> Mapping[str, Any]:
     if not isinstance(mapping, Mapping):
         raise ValueError(f"must be a mapping with the keys {', '.join(legal)}; got {mapping!r}")
-    if unknown := [key for key in mapping if key not in legal]:
-        raise ValueError(f"key {unknown[0]!r} is unknown; legal: {', '.join(legal) or 'none'}")
+    if others := [key for key in mapping if key not in legal]:
+        raise ValueError(unknown("key", others[0], legal))
     if missing := [key for key in needed if key not in mapping]:
         raise ValueError(f"key {missing[0]!r} is missing; needed: {', '.join(needed)}")
     return mapping

@@ -74,13 +74,13 @@ class Palette:
 
     def __call__(self, name: str) -> Material:
         """Raises ValueError where no material has this name."""
-        found = self.own.get(name) or known(name)
-        if found is None:
+        material = self.own.get(name) or known(name)
+        if material is None:
             raise ValueError(
                 f"material {name!r} is unknown; known: {', '.join([*self.own, *_KNOWN])}, NMC and three digits; or add "
                 f"materials: {{{name}: {{formula: ..., density: ...}}}} in the phantom (g/cm3)"
             )
-        return found
+        return material
 
     def filters(self, name: str) -> Attenuation:
         """The attenuation of a material, for `spectrum.light`. Raises ValueError as above."""

@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import nnls
 
 from simulators.light.beam import Beam, Tube
 
@@ -74,16 +73,16 @@ def light(
         raise ValueError("materials need the beam's energy: give it energy_kev, spectrum or tube")
     attenuations = list(materials)
     if beam.spectrum is not None:
-        found = Spectrum.of(*zip(*beam.spectrum, strict=True))
+        spectrum = Spectrum.of(*zip(*beam.spectrum, strict=True))
     elif beam.bandwidth is None and beam.tube is None:
-        found = _nodes(beam, 1, filters)
+        spectrum = _nodes(beam, 1, filters)
     else:
-        found = _converged(beam, attenuations, thickness, filters)
-    if found.energies.size <= _A_FEW or not attenuations:
-        return found
-    attenuation = np.stack([material(found.energies) for material in attenuations], axis=1)
-    kept, weights = fewer(attenuation, found.weights, thickness, ENOUGH / 5)
-    return Spectrum(found.energies[kept], weights)
+        spectrum = _converged(beam, attenuations, thickness, filters)
+    if spectrum.energies.size <= _A_FEW or not attenuations:
+        return spectrum
+    attenuation = np.stack([material(spectrum.energies) for material in attenuations], axis=1)
+    kept, weights = fewer(attenuation, spectrum.weights, thickness, ENOUGH / 5)
+    return Spectrum(spectrum.energies[kept], weights)
 
 
 def _converged(
@@ -169,6 +168,8 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     Returns:
         All energies where fewer do not suffice, or are not found.
     """
+    from scipy.optimize import nnls  # half a second
+
     n_materials = attenuation.shape[1]
     ways = [np.eye(n_materials)]
     for pair in combinations(range(n_materials), 2):
@@ -185,19 +186,19 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     enough = np.flatnonzero(exact)
     through = through[:, enough]
     chosen: list[int] = []
-    found = np.zeros(0)
+    shares = np.zeros(0)
     missing = light
     while len(chosen) < enough.size:
         pull = through.T @ missing
         pull[chosen] = -np.inf
         chosen.append(int(np.argmax(pull)))
-        found, _ = nnls(through[:, chosen], light)
-        found /= found.sum()
-        missing = light - through[:, chosen] @ found
+        shares, _ = nnls(through[:, chosen], light)
+        shares /= shares.sum()
+        missing = light - through[:, chosen] @ shares
         if np.abs(missing).max() <= tolerance:
             break
     else:
         return np.arange(weights.size), weights
-    kept = enough[chosen][found > 0]
+    kept = enough[chosen][shares > 0]
     order = np.argsort(kept)
-    return kept[order], found[found > 0][order]
+    return kept[order], shares[shares > 0][order]

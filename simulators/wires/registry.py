@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 
 from drivers.flat import flat_fields
-from drivers.plugins import plugins
 from simulators.wires.wire import Build
+from splatline.registry import Registry
 
 REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's module `wire`
     "pm16c": "PM16CBuild",
@@ -22,8 +22,9 @@ def _fitting(name: str, found: type[Build]) -> type[Build]:
     return found
 
 
-WIRES: dict[str, type[Build]] = {
-    **{kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
-    **plugins("wire", REGISTRY, _fitting),
-}
+WIRES: Registry[type[Build]] = Registry(
+    "wire",
+    {kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
+    _fitting,
+)
 """Kind -> how its simulated controller is built."""

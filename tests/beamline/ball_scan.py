@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,9 @@ BALL = {
 }
 
 
+@cache
 def shipped(name: str, *overrides: str) -> Config:
+    """A value, read once."""
     return config.load(config.config_folder() / f"{name}.yaml", overrides, {})
 
 

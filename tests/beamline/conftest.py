@@ -30,4 +30,4 @@ def real_pictures() -> None:
 @pytest.fixture(autouse=True)
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "real_pictures" not in request.fixturenames:
-        monkeypatch.setattr("beamline.report.figures.FigureCanvasAgg", BlankCanvas)
+        monkeypatch.setattr("beamline.report.figures.canvas", BlankCanvas)

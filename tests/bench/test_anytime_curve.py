@@ -32,7 +32,7 @@ from recon.warm_up import warm_up
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
-from tests.recon.splatting.test_stream import StepClock
+from tests.clock import SteppedClock
 
 F32 = NDArray[np.float32]
 Scan = tuple[F32, Geometry, F32]
@@ -91,7 +91,7 @@ def streamed(scan: Scan, renders: int) -> QualityCurve:
     """A stream that renders so many views while one is taken, and LAST in its last round."""
     data, geometry, truth = scan
     begin, grid = time.process_time(), Grid.matching(geometry)
-    model = StreamingFit(geometry, grid, now=StepClock(0.5))  # which counts steps
+    model = StreamingFit(geometry, grid, now=SteppedClock(tick=0.5))  # which counts steps
     share = model.settings.views_per_step
     found = []
     for view in range(VIEWS):

@@ -1,4 +1,7 @@
-"""The published R²-Gaussian beside ours, and what each departure from it gains; pytest -m bench -s tests/bench."""
+"""The published R²-Gaussian beside ours, and what each departure from it gains; pytest -m bench -s tests/bench.
+
+CURVE_SECONDS=15,60,240 pytest -m bench -s tests/bench/test_published.py -k "time and teapot"
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ import pytest
 import recon
 from recon.assess.metrics import psnr, ssim3d
 from recon.base.kernel import Kernel
+from recon.base.method import RunControl
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.published import R2Published, published_fit
 from recon.splatting.settings import FitSettings
@@ -42,9 +46,7 @@ DEPARTURES = {
 
 
 def ours(steps: int | None = None, finish: int | None = None, count: int | None = None, **fit: Any) -> recon.R2:
-    """Our fit with these settings; its rates fall with the square root of more steps."""
-    pace = OURS.pace if steps is None else OURS.pace * (400 / steps) ** 0.5
-    return recon.R2(steps=steps, finish=finish, gaussians=count, fit=replace(OURS, **{"pace": pace, **fit}))
+    return recon.R2(steps=steps, finish=finish, gaussians=count, fit=replace(OURS, **fit))
 
 
 FEW = 15_000 if SIZE == 128 else 3000
@@ -81,13 +83,27 @@ TOWARDS = {
 
 def line(case: Case, label: str, method: recon.R2) -> str:
     cpu, wall = time.process_time(), time.perf_counter()
-    found = recon.reconstruct(case.projections, case.geometry, method, grid=case.grid)
+    control = RunControl(now=time.process_time)
+    found = recon.reconstruct(case.projections, case.geometry, method, grid=case.grid, control=control)
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     volume = np.clip(found.volume.data, 0, None)
     return (
         f"{case.name:8} {label:62} {psnr(case.truth, volume, case.peak):6.2f} dB  {ssim3d(case.truth, volume):.3f}"
-        f"  {found.settings['gaussians']:>6} Gaussians  {cpu:6.0f} CPU s  {wall:6.0f} s"
+        f"  {found.settings['gaussians']:>6} Gaussians  {found.settings['steps']:>5} steps"
+        f"  {cpu:6.0f} CPU s  {wall:6.0f} s"
     )
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("seconds", [float(s) for s in os.environ.get("CURVE_SECONDS", "15,30,60,120,240").split(",")])
+@pytest.mark.parametrize("name", ["teapot", "shell", "thorax"])
+def test_accuracy_against_time(shared_data: Path, name: str, seconds: float) -> None:
+    """A point of both curves: each fit plans for these processor seconds, and ends in 1.2 times them."""
+    case = cone(shared_data, name, VIEWS, SIZE, seen_by_simulator)
+    for label, method in (("ours", recon.R2(seconds=seconds)), ("as published", replace(PUBLISHED, steps=None))):
+        begin = time.process_time()
+        print("\n" + line(case, f"{label}, {seconds:g} s", replace(method, seconds=seconds)), flush=True)
+        assert time.process_time() - begin < 1.2 * seconds + 5  # a second or so of judging
 
 
 @pytest.mark.parametrize("label", [*DEPARTURES, *TOWARDS])

@@ -62,7 +62,9 @@ function nameFrame() {
 }
 
 $("frame-slider").addEventListener("input", (event) => { $("newest").checked = false; showFrame(Number(event.target.value)); });
-$("newest").addEventListener("change", () => { if ($("newest").checked) showFrame(frames - 1); });
+$("newest").addEventListener("change", () => { if ($("newest").checked) showFrame(newestFrame()); });
+/** The newest view: flats and darks that follow it are of no interest; before the first view, the newest frame. */
+function newestFrame() { const view = columns.kind.lastIndexOf(0); return view < 0 ? frames - 1 : view; }
 $("corrected").addEventListener("change", () => showFrame(current));
 
 // --- flags -------------------------------------------------------------------------------------------------------
@@ -79,16 +81,16 @@ async function fetchFlags() {
 }
 
 // --- sinogram ----------------------------------------------------------------------------------------------------
-let strip = { row: null, lines: [], views: [], cols: 0, busy: false };
+let strip = { row: null, lines: [], views: [], order: [], cols: 0, busy: false };
 const sinogram = new Picture($("sinogram"), {
   stretch: true,
-  point: (view, col, value) => { $("sinogram-value").textContent = view === null || strip.views[view] === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
+  point: (line, col, value) => { const view = strip.order[line]; $("sinogram-value").textContent = view === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
 });
 
 async function fetchSinogram() {
   if (!facts || strip.busy) return;
   const row = Number($("sinogram-row").value);
-  if (strip.row !== row) strip = { row, lines: [], views: [], cols: 0, busy: false };
+  if (strip.row !== row) strip = { row, lines: [], views: [], order: [], cols: 0, busy: false };
   strip.busy = true;
   const mine = strip;
   try {
@@ -97,13 +99,24 @@ async function fetchSinogram() {
     for (let i = 0; i < tile.shape[0]; i++) mine.lines.push(Float32Array.from(tile.numbers.subarray(i * mine.cols, (i + 1) * mine.cols), (number) => tile.offset + tile.scale * number));
     mine.views.push(...tile.views);
     if (mine.views.length) {
-      const packed = packLines(mine.lines, mine.cols);
+      mine.order = byAngle(mine.views);
+      const packed = packLines(mine.order.map((view) => mine.lines[view]), mine.cols);
       sinogram.window = usualWindow(packed);
       sinogram.show(packed, [mine.lines.length, mine.cols]);
     }
-    $("sinogram-name").textContent = `of row ${row}, ${mine.views.length} views`;
+    $("sinogram-name").textContent = `of row ${row}, ${mine.views.length} views${mine.order.some((view, line) => view !== line) ? ", by angle" : ""}`;
   } catch (error) { $("sinogram-name").textContent = error.message; }
   mine.busy = false;
+}
+
+/** Numbers of the views by their angle within a turn; as taken, where the stage turned one way. */
+function byAngle(frames) {
+  const angles = frames.map((frame) => columns.angle[frame]), order = frames.map((_, view) => view);
+  const steps = angles.slice(1).map((angle, view) => Math.sign(angle - angles[view]));
+  const turned = Math.max(...angles) - Math.min(...angles);
+  if (angles.some((angle) => angle === null || angle === undefined) || (new Set(steps).size < 2 && turned <= 360)) return order;
+  const within = angles.map((angle) => ((angle % 360) + 360) % 360);
+  return order.sort((a, b) => within[a] - within[b]);
 }
 
 function packLines(lines, cols) {
@@ -202,6 +215,7 @@ function onRun(event) {
     case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
     case "flag": advice.push(data); log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning", data.frame); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
+    case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "progress": if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
     case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
@@ -244,7 +258,7 @@ async function onState(event) {
     $("frame-slider").max = Math.max(0, frames - 1);
     const added = await (await fetch(`api/columns?first=${columns.kind.length}`)).json();
     if (added.first === columns.kind.length) for (const name of Object.keys(columns)) columns[name].push(...added[name]);
-    if ($("newest").checked) showFrame(frames - 1); else nameFrame();
+    if ($("newest").checked) showFrame(newestFrame()); else nameFrame();
     fetchSinogram();
     if ($("curve").value === "trace") fetchTrace();
   }

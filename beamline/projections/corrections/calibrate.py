@@ -12,6 +12,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.projections.selection import geometry_of, pivot_of, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
+from splatline.registry import unknown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,9 +40,8 @@ def _terms(text: str) -> tuple[str, ...]:
     if names == ["none"]:
         return ()
     every = *GEOMETRY, *OF_VIEWS
-    unknown = [name for name in names if name not in every]
-    if unknown:
-        raise ValueError(f"{', '.join(unknown)!r} is not known; choose from {', '.join(every)}")
+    if others := [name for name in names if name not in every]:
+        raise ValueError(unknown("term", others[0], every))
     return tuple(name for name in every if name in names)
 
 
@@ -120,7 +120,7 @@ class Calibrate:
         done = [views.done[self.name]] if self.name in views.done else []
         learn = {"background": without_learnt_background, "gains": without_learnt_gains}
         done += [learn[term](views, progress) for term in OF_VIEWS if term in self.terms]
-        sentence = " ".join(each.said for each in done if each.said)
+        sentence = " ".join(each.sentence for each in done if each.sentence)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
         return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
 
@@ -149,7 +149,7 @@ class Calibrated:
 
     @property
     def done(self) -> StepDone:
-        return StepDone(self.learnt.said(self.binning), self.learnt.parameters(self.binning))
+        return StepDone(self.learnt.in_words(self.binning), self.learnt.parameters(self.binning))
 
     @property
     def axis(self) -> float:

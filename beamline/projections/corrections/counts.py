@@ -136,7 +136,7 @@ def _counts_of_light(references: References) -> float:
     return float(np.median(references.flats[0][1] - references.dark))
 
 
-def noise_said(references: References, photons: Photons | None) -> str:
+def noise_sentence(references: References, photons: Photons | None) -> str:
     """How counts become line integrals, in words; empty where they are logarithms."""
     if photons is None:
         return ""

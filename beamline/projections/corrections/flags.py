@@ -86,19 +86,19 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
-        return UsableViews(rows, said=sentence, flags=flags)
+        return UsableViews(rows, sentence=sentence, flags=flags)
     treated = treatment_of(flags, views, source.shape)
-    if not treated.said:
+    if not treated.in_words:
         return UsableViews(rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
-    gap = gap_said(source, rows, good)
-    sentence = f"{treated.said}{gap and f' They{gap}.'} --flags ignore takes all alike."
+    gap = gap_sentence(source, rows, good)
+    sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore takes all alike."
     regions = regions_of(treated.flags, source.shape)
     return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
-def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
+def gap_sentence(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
     """ " leave 12° without a view" where the views left have such a gap, which those before had not; else empty."""
     period = np.pi if source.cone is None else 2 * np.pi
     narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))

@@ -77,7 +77,7 @@ class Jumps:
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return SampleJumps(usable.frames, said=sentence if usable.jumps.size else "")
+        return SampleJumps(usable.frames, sentence=sentence if usable.jumps.size else "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,18 +88,18 @@ class SampleJumps:
         starts: int64, rows of the file at which a part begins, without the first.
         moves: displacement of each part; empty: none moved.
         frames: int64 [view], the rows that are used.
-        said: what was done, in a line; empty where there was no jump.
+        sentence: what was done, in a line; empty where there was no jump.
     """
 
     frames: I64
     starts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     moves: tuple[Displacement, ...] = ()
-    said: str = ""
+    sentence: str = ""
 
     @property
     def done(self) -> StepDone:
         """What the step did; the file of a volume records jumps where there were some."""
-        return StepDone(self.said, {"jumps": self.said} if self.said else {}, warned=True)
+        return StepDone(self.sentence, {"jumps": self.sentence} if self.sentence else {}, warned=True)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The geometry of these rows of the file, views shifted and turned as the sample was."""
@@ -138,8 +138,8 @@ def find_jumps(
         where = frames_text(jumps)
         return SampleJumps(
             frames,
-            said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
-            "it had not moved. Choose those of one side with --views.",
+            sentence=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as "
+            "if it had not moved. Choose those of one side with --views.",
         )
     fit = _Fit(source, selection, axis_col, frames, jumps)
     clusters = jump_clusters(fit.sizes)

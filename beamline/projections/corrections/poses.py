@@ -98,7 +98,7 @@ class ScanPoses:
         shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN where the file states none.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
-        said: in a line, what was read.
+        sentence: in a line, what was read.
         pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
         binning: of the detector's pixels.
     """
@@ -107,13 +107,13 @@ class ScanPoses:
     roll: F64
     tilt: F64
     frames: I64
-    said: str
+    sentence: str
     pivot: float
     binning: int
 
     @property
     def done(self) -> StepDone:
-        return StepDone(self.said)
+        return StepDone(self.sentence)
 
     def stated(self, view_ids: I64) -> NDArray[np.bool_]:
         """[view] whether the file states their pose."""

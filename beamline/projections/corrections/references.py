@@ -207,7 +207,7 @@ def _mean(
     return total / n if n else None
 
 
-def flats_said(source: ScanSource, references: References, current_factor: NDArray[np.float64] | None) -> str:
+def flats_sentence(source: ScanSource, references: References, current_factor: NDArray[np.float64] | None) -> str:
     """What was done about changes of the beam, in words; empty where nothing was asked."""
     sentences = []
     if current_factor is not None:

@@ -37,11 +37,11 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     try:
         for _, where in PLACES:
             hdf5.refuse_broken(file, where)
-        found = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
+        datasets = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
         order = _order(file["exchange/data"])
         stacks = [
             FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
-            for kind, where, item in found
+            for kind, where, item in datasets
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
@@ -112,8 +112,8 @@ def _measured(
     value, item = _positive(file, where, units), hdf5.dataset(file, where)
     if value is None or item is None or hdf5.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    said = f"{np.ravel(hdf5.first_of(item))[0]:.6g}"
-    source.stated += (NotUsed(where, said, "it has no attribute `units`, and in the SI's it cannot be", True),)
+    number = f"{np.ravel(hdf5.first_of(item))[0]:.6g}"
+    source.stated += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 
 
@@ -140,17 +140,17 @@ def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
 
 
 def _attributes(file: h5py.File) -> dict[str, str | float | int]:
-    said: dict[str, str | float | int] = {}
+    facts: dict[str, str | float | int] = {}
     for name, value in file.attrs.items():
         if isinstance(value, np.number):
-            said[name] = float(value)
+            facts[name] = float(value)
         else:
-            said[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
+            facts[name] = " ".join(hdf5.text(part) for part in np.ravel(value))
     for name, where in TEXTS.items():
         if hdf5.dataset(file, where) is not None:
-            said[name] = hdf5.text_at(file, where)
-    said["theta_units"] = hdf5.attribute(file["exchange"].get("theta", file), "units") or "not given"
-    return said
+            facts[name] = hdf5.text_at(file, where)
+    facts["theta_units"] = hdf5.attribute(file["exchange"].get("theta", file), "units") or "not given"
+    return facts
 
 
 def _recognises(path: Path, opening: Opening) -> bool:

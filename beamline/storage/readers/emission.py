@@ -32,11 +32,11 @@ class EmissionSource(StacksSource):
         )  # fmt: skip
         self._counts = views
         self.dtype, self.quantity = np.dtype(np.float32), "line_integrals"
-        self._sets = {name: found for name in SETS if (found := hdf5.dataset(file, f"{GROUP}/{name}")) is not None}
-        for name, found in self._sets.items():
-            hdf5.require_real(found.dtype, f"{found.name} in {path}")
-            if found.shape != views.shape:
-                raise DataError(f"{path}: {name} has shape {found.shape}, the counts {views.shape} [view, row, col].")
+        self._sets = {name: dataset for name in SETS if (dataset := hdf5.dataset(file, f"{GROUP}/{name}")) is not None}
+        for name, dataset in self._sets.items():
+            hdf5.require_real(dataset.dtype, f"{dataset.name} in {path}")
+            if dataset.shape != views.shape:
+                raise DataError(f"{path}: {name} has shape {dataset.shape}, the counts {views.shape} [view, row, col].")
         angles = hdf5.radians(dataset_at(file, f"{GROUP}/angles"))
         if angles.shape != self.angles.shape:
             raise DataError(f"{path}: {angles.size} angles for {self.angles.size} views; expected one for each.")
@@ -63,9 +63,9 @@ class EmissionSource(StacksSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Line integrals of the activity [frame, row, col], in counts; NaN where nothing survives."""
-        found = self._counted(frame_indices(frames, self.image_key.size), rows)
-        lines = np.full_like(found.counts, np.nan)
-        return np.divide(found.counts - found.background, found.survival, out=lines, where=found.survival > 0)
+        counted = self._counted(frame_indices(frames, self.image_key.size), rows)
+        lines = np.full_like(counted.counts, np.nan)
+        return np.divide(counted.counts - counted.background, counted.survival, out=lines, where=counted.survival > 0)
 
 
 def _recognises(path: Path, opening: Opening) -> bool:

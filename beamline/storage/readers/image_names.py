@@ -55,10 +55,10 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
         series.setdefault(re.sub(r"\d+", "", short), []).append(name)
     sample = _sample_of(series, kinds)
     if sample is None:
-        found = ", ".join(f"{len(some)} of {key!r}" for key, some in [*series.items()][:6])
+        numbers = ", ".join(f"{len(some)} of {key!r}" for key, some in [*series.items()][:6])
         raise DataError(
-            f"{path} holds no projections: all images are named as darks or flats ({found}). If a sample is called so, "
-            "give the folder of its projections, and the others with --darks and --flats."
+            f"{path} holds no projections: all images are named as darks or flats ({numbers}). If a sample is called "
+            "so, give the folder of its projections, and the others with --darks and --flats."
         )
     return kinds | dict.fromkeys(series[sample], FrameKind.PROJECTION)
 
@@ -117,7 +117,7 @@ def angles_of(names: Sequence[str]) -> NDArray[np.float64] | None:
             degrees.append(int(plain[0][0]) + int(plain[0][1]) / 1000)
         else:
             return None
-    found = np.array(degrees)
-    if not found.size or np.ptp(found) < _LEAST_SPAN or np.abs(found).max() > _FARTHEST:
+    angles = np.array(degrees)
+    if not angles.size or np.ptp(angles) < _LEAST_SPAN or np.abs(angles).max() > _FARTHEST:
         return None
-    return np.radians(found) if 2 * np.unique(found).size > found.size else None
+    return np.radians(angles) if 2 * np.unique(angles).size > angles.size else None

@@ -30,7 +30,7 @@ class Places:
 
 def find(file: h5py.File) -> list[Places]:
     """Every tomography entry of a file; [] where it has none. DataError where the frames' own file is missing."""
-    found = []
+    places = []
     unresolved: list[str] = []
     for name in file:
         top = hdf5.resolve(file, name)
@@ -44,10 +44,10 @@ def find(file: h5py.File) -> list[Places]:
                     if broken := hdf5.broken_link(detector, name):
                         unresolved.append(broken)
                 if key is not None and data is not None and data.ndim == 3:
-                    found.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
-    if unresolved and not found:
+                    places.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
+    if unresolved and not places:
         raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
-    return found
+    return places
 
 
 def groups(parent: Any) -> list[h5py.Group]:

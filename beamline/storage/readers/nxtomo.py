@@ -59,8 +59,8 @@ class NXtomoSource(ScanSource):
             self.dtype = places.data.dtype
             definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
             self.format = _format(definition, hdf5.text_at(places.entry, "program_name"))
-            said = hdf5.text_at(self._file, "/entry/record/quantity")
-            self.quantity = _quantity(said, self.dtype)
+            stated_quantity = hdf5.text_at(self._file, "/entry/record/quantity")
+            self.quantity = _quantity(stated_quantity, self.dtype)
             self._geometry = None if self._ours else read_geometry(places)
             if self._geometry is None:
                 self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
@@ -168,33 +168,33 @@ class NXtomoSource(ScanSource):
     def attributes(self) -> dict[str, str | float | int]:
         """What else the file says: sample, title, times, status, missing triggers, why it ended early."""
         with hdf5.readable(self.path):
-            return self._said()
+            return self._facts()
 
-    def _said(self) -> dict[str, str | float | int]:
+    def _facts(self) -> dict[str, str | float | int]:
         entry = self._places.entry
-        said: dict[str, str | float | int] = {}
+        facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
             value = hdf5.text_at(entry, where)
             if value:
-                said[name] = value
+                facts[name] = value
         for name, where, units in NUMBERS:
             number = hdf5.scalar(entry, where, units)
             if number is not None:
-                said[name] = number
-        if "exposure_s" not in said and np.isfinite(self.exposures).any():
-            said["exposure_s"] = float(np.nanmedian(self.exposures))
+                facts[name] = number
+        if "exposure_s" not in facts and np.isfinite(self.exposures).any():
+            facts["exposure_s"] = float(np.nanmedian(self.exposures))
         if self._geometry is not None:
-            said |= self._geometry.remarks
+            facts |= self._geometry.remarks
         if self._places.angle_problem:
-            said["angles"] = f"unknown: {self._places.angle_problem}"
+            facts["angles"] = f"unknown: {self._places.angle_problem}"
         if self._places.data.is_virtual:
-            said["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
+            facts["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
         if self._ours:
             ending = ending_in(self._file)
-            said |= {"status": ending.status, "missing_triggers": len(ending.missing)}
+            facts |= {"status": ending.status, "missing_triggers": len(ending.missing)}
             if ending.reason:
-                said["ended"] = ending.reason
-        return said
+                facts["ended"] = ending.reason
+        return facts
 
     @property
     def ending(self) -> ScanEnding:
@@ -208,9 +208,9 @@ class NXtomoSource(ScanSource):
         outside = not_copied(self._places.entry, TEXTS.values())
         if self._geometry is None:
             return outside
-        found = outside + not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        fields = outside + not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         turned = self._geometry.turned
-        return (*found, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else found
+        return (*fields, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else fields
 
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
@@ -311,8 +311,8 @@ class NXtomoSource(ScanSource):
     def row_period(self) -> float | None:
         devices = self._file.get("/entry/instrument/devices") if self._ours else None
         with hdf5.readable(self.path):
-            said = [device["row_period"] for device in (devices or {}).values() if "row_period" in device]
-            return float(said[0][()]) if said else None
+            periods = [device["row_period"] for device in (devices or {}).values() if "row_period" in device]
+            return float(periods[0][()]) if periods else None
 
     @property
     def plan(self) -> Mapping[str, Any]:

@@ -32,7 +32,7 @@ from beamline.storage.readers.wrapped import (
     type_wrapped,
 )
 from drivers.base.frame import FrameKind
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -55,9 +55,10 @@ def _fitting(name: str, found: Any) -> ScanFormat:
     return found
 
 
-FORMATS: tuple[ScanFormat, ...] = (
-    *(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY),
-    *plugins("reader", REGISTRY, _fitting).values(),
+FORMATS: tuple[ScanFormat, ...] = tuple(
+    Registry(
+        "reader", {name: import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY}, _fitting
+    ).values()
 )
 """Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 

@@ -83,14 +83,14 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
         return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
-    found = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
-    if len(found) == 1:
-        return _read(path, found[0])
-    listed = (found or [*_images(file)])[:_LISTED]
+    candidates = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
+    if len(candidates) == 1:
+        return _read(path, candidates[0])
+    listed = (candidates or [*_images(file)])[:_LISTED]
     shapes = ", ".join(f"{item.name} ({' x '.join(map(str, item.shape))})" for item in listed)
     wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
     option = f"--{kind.name.lower()}s"
-    if found:
+    if candidates:
         raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
     raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
 

@@ -136,11 +136,11 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
         hdf5.require_real(item.dtype, f"{where} in {path}")
-        said = unit or hdf5.attribute(item, "units")
-        factor = hdf5.ANGLE_UNITS.get(said.lower())
+        stated_unit = unit or hdf5.attribute(item, "units")
+        factor = hdf5.ANGLE_UNITS.get(stated_unit.lower())
         if factor is None:
-            found = f"the units {said!r}" if said else "no attribute `units`"
-            raise DataError(f"{where} in {path} has {found}: say --angles-unit deg or --angles-unit rad.")
+            problem = f"the units {stated_unit!r}" if stated_unit else "no attribute `units`"
+            raise DataError(f"{where} in {path} has {problem}: say --angles-unit deg or --angles-unit rad.")
         return np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
 
 
@@ -155,9 +155,9 @@ def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
 
 def datasets_text(file: h5py.File) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    found = list[h5py.Dataset]()
-    file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
-    found.sort(key=lambda item: (-item.ndim, -item.size))
-    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in found[:_LISTED]]
-    more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    datasets = list[h5py.Dataset]()
+    file.visititems(lambda _, item: datasets.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
+    datasets.sort(key=lambda item: (-item.ndim, -item.size))
+    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in datasets[:_LISTED]]
+    more = f" and {len(datasets) - _LISTED} more" if len(datasets) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."

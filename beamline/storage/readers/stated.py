@@ -56,22 +56,22 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
 
     Numbers that would be used, were their unit known, are among them.
     """
-    found = []
+    unused = []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
         if item is None or item.size == 0 or hdf5.is_foreign(item):
             continue
         if item.size * item.dtype.itemsize > hdf5.BRIEF:  # no place, time or number of each frame
-            found.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
+            unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
         value, unit = np.asarray(hdf5.values_of(item)), hdf5.attribute(item, "units")
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
-            found.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
+            unused.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
         elif field.units is not None and unit.lower() not in field.units and _true(value, item, source):
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
-            found.append(NotUsed(field.where, _text(value, unit), why, True))
-    return tuple(found)
+            unused.append(NotUsed(field.where, _text(value, unit), why, True))
+    return tuple(unused)
 
 
 def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
@@ -93,12 +93,12 @@ def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None
 def _text(value: NDArray[Any], units: str) -> str:
     if value.size == 1:
         first = value.reshape(-1)[0]
-        said = f"{first:.6g}" if value.dtype.kind == "f" else hdf5.text(first)
+        text = f"{first:.6g}" if value.dtype.kind == "f" else hdf5.text(first)
     elif value.dtype.kind in "uif" and value.size and value.ndim == 1:
-        said = f"{np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if np.isfinite(value).any() else "nan"
+        text = f"{np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if np.isfinite(value).any() else "nan"
     else:
-        said = " x ".join(map(str, value.shape)) + " values"
-    return printable(f"{said} {units}".strip())
+        text = " x ".join(map(str, value.shape)) + " values"
+    return printable(f"{text} {units}".strip())
 
 
 def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:

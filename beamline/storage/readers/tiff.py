@@ -37,10 +37,10 @@ class Complaints(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)
-        self.said: list[str] = []
+        self.messages: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.said.append(record.getMessage())
+        self.messages.append(record.getMessage())
 
     def __enter__(self) -> Complaints:
         logging.getLogger("tifffile").addHandler(self)
@@ -85,8 +85,8 @@ def appended(tif: tifffile.TiffFile) -> bool:
     first = tif.pages.first
     if not tif.is_shaped or first.ndim != 2:
         return False
-    said = re.search(r'"shape": \[([\d, ]*)\]', first.description)
-    return said is not None and [int(n) for n in said[1].split(",") if n.strip()] == [*first.shape]
+    match = re.search(r'"shape": \[([\d, ]*)\]', first.description)
+    return match is not None and [int(n) for n in match[1].split(",") if n.strip()] == [*first.shape]
 
 
 def pages_one_by_one(tif: tifffile.TiffFile) -> bool:

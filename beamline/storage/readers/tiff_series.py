@@ -235,10 +235,12 @@ def _check_one_series(path: Path, names: list[str]) -> None:
         raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
     prefixes = sorted({_prefix(name) for name in names})
     if len(prefixes) > 1 and (angles_of(names) is None or len({_prefix(without_angle(name)) for name in names}) > 1):
-        found = ", ".join(f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6])
+        numbers = ", ".join(
+            f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6]
+        )
         raise DataError(
-            f"{path} holds several series of images: {found}. Name darks and flats so (dark_0001.tif, flat_0001.tif), "
-            "or give the folder of the projections, and the others apart, with --darks and --flats."
+            f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, "
+            "flat_0001.tif), or give the folder of the projections, and the others apart, with --darks and --flats."
         )
 
 
@@ -252,8 +254,8 @@ def _numbers_of_frames(references: list[str], series: list[str]) -> NDArray[np.i
 
 def _numbers(names: list[str]) -> NDArray[np.int64] | None:
     """The number at the end of each name; None where one has none, or where they are no counts (dates)."""
-    found = [re.search(r"(\d{1,18})\.\w+$", name) for name in names]
-    numbers = np.array([int(match[1]) for match in found if match is not None], np.int64)
+    matches = [re.search(r"(\d{1,18})\.\w+$", name) for name in names]
+    numbers = np.array([int(match[1]) for match in matches if match is not None], np.int64)
     if numbers.size < len(names) or np.ptp(numbers) > COUNTED * numbers.size:
         return None
     return numbers

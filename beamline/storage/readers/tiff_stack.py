@@ -35,13 +35,13 @@ class TiffStackSource(ScanSource):
             try:
                 n = self._look()
             except UNREADABLE as error:
-                complaints.said.append(str(error))
+                complaints.messages.append(str(error))
             except BaseException:
                 self._tif.close()
                 raise
-        if complaints.said:
+        if complaints.messages:
             self._tif.close()
-            raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.said[0]}).")
+            raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.messages[0]}).")
         self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
         self.angles = np.full(n, np.nan)
         self.exposures = np.full(n, np.nan)

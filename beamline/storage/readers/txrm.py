@@ -56,8 +56,8 @@ class TxrmFile:
 
     def number(self, name: str) -> int | None:
         """The first whole number of a stream; None where there is none."""
-        found = self.numbers(name, "<i4")
-        return None if found is None else int(found[0])
+        numbers = self.numbers(name, "<i4")
+        return None if numbers is None else int(numbers[0])
 
     def image(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
         """An image [row, col]; ValueError where the stream has another size."""
@@ -183,8 +183,8 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
     The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
     it). In a real file the displacement of each view against the one before has the opposite sign, too.
     """
-    found = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
-    shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in found], axis=1)
+    shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
+    shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
     if not np.isfinite(shifts).all():
         raise DataError(f"{path}: {(~np.isfinite(shifts)).sum()} of its views' shifts are no numbers: it is damaged.")
     return shifts
@@ -204,8 +204,8 @@ def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
 def _set_scale(source: StacksSource, file: TxrmFile) -> None:
     """Pixel size, which the file states at the sample (µm), and the distances of a cone (mm, of either sign)."""
     pixel, near, far = (
-        None if found is None else abs(float(found[0]))
-        for found in (
+        None if lengths is None else abs(float(lengths[0]))
+        for lengths in (
             file.numbers(f"ImageInfo/{name}", "<f4") for name in ("PixelSize", "StoRADistance", "DtoRADistance")
         )
     )
@@ -221,9 +221,9 @@ def _facts(file: TxrmFile) -> dict[str, str | float | int]:
     """What else the file says, in its own units."""
     facts: dict[str, str | float | int] = {}
     for name in ("Energy", "Current", "OpticalMagnification", "CamPixelSize", "Temperature"):
-        found = file.numbers(f"ImageInfo/{name}", "<f4")
-        if found is not None and np.isfinite(found[0]):
-            facts[name] = float(found[0])
+        values = file.numbers(f"ImageInfo/{name}", "<f4")
+        if values is not None and np.isfinite(values[0]):
+            facts[name] = float(values[0])
     return facts
 
 

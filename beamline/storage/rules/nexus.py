@@ -31,13 +31,13 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
         return [Finding("error", "layout", f"{rule.__name__}: damaged, or not laid out as it should be ({error}).")]
 
 
-def definition_said(places: Places) -> Iterator[Finding]:
+def definition_stated(places: Places) -> Iterator[Finding]:
     """The entry says that it is an NXtomo."""
-    said = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
-    if said == layout.FLOAT_DEFINITION:
-        yield Finding("info", "definition", f"{said}: float frames in NXtomo's places, on purpose not an NXtomo.")
-    elif said != layout.NXTOMO:
-        yield Finding("warning", "definition", f"{places.entry.name}/definition is {said!r}, expected 'NXtomo'.")
+    definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+    if definition == layout.FLOAT_DEFINITION:
+        yield Finding("info", "definition", f"{definition}: float frames in NXtomo's places, on purpose not an NXtomo.")
+    elif definition != layout.NXTOMO:
+        yield Finding("warning", "definition", f"{places.entry.name}/definition is {definition!r}, expected 'NXtomo'.")
 
 
 def integer_frames(places: Places) -> Iterator[Finding]:
@@ -78,8 +78,8 @@ def angle_units(places: Places) -> Iterator[Finding]:
     if places.angle is not None:
         unit = hdf5.attribute(places.angle, "units")
         if unit.lower() not in hdf5.ANGLE_UNITS:
-            said = f"the units {unit!r}" if unit else "no units attribute"
-            yield Finding("error", "angle-units", f"{places.angle.name} has {said}; expected degree or rad.")
+            units = f"the units {unit!r}" if unit else "no units attribute"
+            yield Finding("error", "angle-units", f"{places.angle.name} has {units}; expected degree or rad.")
 
 
 def links_targeted(places: Places) -> Iterator[Finding]:
@@ -120,7 +120,7 @@ def axis_order(places: Places) -> Iterator[Finding]:
             yield Finding("warning", "axes", f"axis {axis!r} of {nxdata.name} is no float dataset of {n} numbers.")
 
 
-def names_said(places: Places) -> Iterator[Finding]:
+def names_stated(places: Places) -> Iterator[Finding]:
     """Sample name and title, which validators and people look for."""
     for where in ("sample/name", "title"):
         if not hdf5.text_at(places.entry, where):
@@ -129,17 +129,17 @@ def names_said(places: Places) -> Iterator[Finding]:
 
 def iso_times(places: Places) -> Iterator[Finding]:
     """start_time and end_time are ISO 8601 and in order."""
-    found = []
+    times = []
     for name in ("start_time", "end_time"):
-        said = hdf5.text_at(places.entry, name)
-        if not said:
+        text = hdf5.text_at(places.entry, name)
+        if not text:
             continue
         try:
-            found.append(datetime.fromisoformat(said))
+            times.append(datetime.fromisoformat(text))
         except ValueError:
-            yield Finding("warning", "iso-times", f"{places.entry.name}/{name} is {said!r}, which is not ISO 8601.")
-    if len(found) == 2 and (found[0].tzinfo is None) == (found[1].tzinfo is None) and found[1] < found[0]:
-        yield Finding("warning", "iso-times", f"It ends ({found[1]}) before it starts ({found[0]}).")
+            yield Finding("warning", "iso-times", f"{places.entry.name}/{name} is {text!r}, which is not ISO 8601.")
+    if len(times) == 2 and (times[0].tzinfo is None) == (times[1].tzinfo is None) and times[1] < times[0]:
+        yield Finding("warning", "iso-times", f"It ends ({times[1]}) before it starts ({times[0]}).")
 
 
 def time_order(places: Places) -> Iterator[Finding]:
@@ -218,7 +218,7 @@ def frames_counted(places: Places) -> Iterator[Finding]:
 
 
 RULES: tuple[Rule, ...] = (
-    definition_said,
+    definition_stated,
     integer_frames,
     key_length,
     key_codes,
@@ -226,7 +226,7 @@ RULES: tuple[Rule, ...] = (
     angle_units,
     links_targeted,
     axis_order,
-    names_said,
+    names_stated,
     iso_times,
     time_order,
     framestamp_order,

@@ -104,24 +104,26 @@ def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGrou
     left, odd = without_odd(groups, limits, views := _views_beside(source, taken.flats))
     dark, lit = ([group for group in left if group[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
     exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
-    found = [*judge([*dark, *lit], limits)[: len(dark)]]
+    groups_judged = [*judge([*dark, *lit], limits)[: len(dark)]]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
         own, seen = (
             [group for group in lit if start <= group[0].row < end],
             exposed[(exposed >= start) & (exposed < end)],
         )
         witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
-        found += judge([*dark, *own], limits, witnesses)[len(dark) :]
+        groups_judged += judge([*dark, *own], limits, witnesses)[len(dark) :]
     alike, brighter = None, None
-    if lit and not any(group.faults for group in found[len(dark) :]):
+    if lit and not any(group.faults for group in groups_judged[len(dark) :]):
         alike = nothing_seen(lit, dark, views)
         fault = flats_like_views(lit, dark, views) or mass_missing(lit, dark, views)
         if fault is not None:
-            found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
+            groups_judged = [
+                replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in groups_judged
+            ]
         else:
             brighter = brighter_in_places(lit, dark, views)
-    found = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in found]
-    judged = sorted([*found, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
+    groups_judged = [_with_unread(source, group, (*taken.darks, *taken.flats)) for group in groups_judged]
+    judged = sorted([*groups_judged, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
     rows = [np.array(group.rows, np.int64) for group in judged]
     n = sum(group.kind is FrameKind.DARK for group in judged)
     return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged), alike, brighter)

@@ -42,7 +42,7 @@ class Treatment:
     jumps: NDArray[np.int64]
 
     @property
-    def said(self) -> str:
+    def in_words(self) -> str:
         """One sentence; empty where no view is flagged."""
         parts = []
         for some, verbs in (
@@ -152,6 +152,6 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
         )
         yield Finding("error", "flags", message)
         return
-    if treated.said:
-        message += f" A reconstruction (--flags use): {treated.said}"
+    if treated.in_words:
+        message += f" A reconstruction (--flags use): {treated.in_words}"
     yield Finding("warning", "flags", message)

@@ -57,8 +57,8 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     if completion_cut_short(path):
-        said = f"Its writer was killed when it became the output; recon --resume {path} makes that of it."
-        return [Finding("error", "partial", said)]
+        sentence = f"Its writer was killed when it became the output; recon --resume {path} makes that of it."
+        return [Finding("error", "partial", sentence)]
     kind = volume_format(path)
     findings = _as_hdf5(path) if kind is None else []
     try:
@@ -85,13 +85,13 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 def source_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan, what is wrong with its references, and what is flagged."""
-    found = list[Finding]()
+    findings = list[Finding]()
     for rule in (*SOURCE_RULES, scan_ended, references_usable, frames_flagged):
         try:
-            found += rule(source)
+            findings += rule(source)
         except LookedEnoughError as error:
-            found.append(Finding("warning", "brief", str(error)))
-    return [*dict.fromkeys(found)]
+            findings.append(Finding("warning", "brief", str(error)))
+    return [*dict.fromkeys(findings)]
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
@@ -103,14 +103,14 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
     """The writer closed the file, and the scan ended as it was planned; else what can be done."""
     ending, n = source.ending, count(source.image_key.size, "frame")
     if not source.finished:
-        said = f"The file was not closed: {n} can be trusted."
+        sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
         planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
-        said = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
+        sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         return
-    yield Finding("warning", "unfinished", f"{said} {next_step(source.path)}".strip())
+    yield Finding("warning", "unfinished", f"{sentence} {next_step(source.path)}".strip())
 
 
 def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
@@ -142,7 +142,7 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
     """
     n, unreadable, why = int(source.image_key.size), list[int](), ""
     if source.altered:
-        yield Finding("error", "records", altered_said(source))
+        yield Finding("error", "records", altered_sentence(source))
     for row in range(n) if progress is not None else ():
         try:
             source.read([row])
@@ -152,12 +152,12 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         if progress is not None:
             progress(row + 1, n)
     if unreadable:
-        said = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
-        yield Finding("error", "unreadable", said)
+        sentence = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
+        yield Finding("error", "unreadable", sentence)
     elif progress is None and source.unreadable:
         which = f"{count(len(source.unreadable), 'frame')} cannot be read: {spans(sorted(source.unreadable))}."
-        said = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` leaves such frames out."
-        yield Finding("warning", "unreadable", f"{said} `validate --deep` reads all frames.")
+        sentence = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` leaves such frames out."
+        yield Finding("warning", "unreadable", f"{sentence} `validate --deep` reads all frames.")
     if source.damaged:
         yield Finding(
             "error",
@@ -170,7 +170,7 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
         yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
 
 
-def altered_said(source: ScanSource) -> str:
+def altered_sentence(source: ScanSource) -> str:
     """Sentences on the rows of a scan whose record differs from its checksum."""
     rows = sorted(source.altered)
     return (
@@ -187,15 +187,15 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
 
 
-def quantity_said(source: ScanSource) -> Iterator[Finding]:
+def quantity_stated(source: ScanSource) -> Iterator[Finding]:
     """It is known what a pixel means: a forgotten or a second logarithm ruins a volume without a sign."""
     if source.quantity == "unknown":
         note = source.attributes.get("quantity")
-        said = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
+        note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
         yield Finding(
             "error",
             "quantity",
-            f"{said} whether pixels are counts, transmission or line integrals: say --quantity counts, "
+            f"{note_text} whether pixels are counts, transmission or line integrals: say --quantity counts, "
             "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
         )
 
@@ -231,12 +231,12 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
         )
     darks = np.unique(exposures[(source.image_key == FrameKind.DARK) & np.isfinite(exposures)])
     if (np.abs(darks - usual) > EXPOSURE_TOLERANCE * usual).any():
-        said = ", ".join(f"{dark:g}" for dark in darks[:4])
+        seconds = ", ".join(f"{dark:g}" for dark in darks[:4])
         yield Finding(
             "warning",
             "exposures",
-            f"The darks were exposed for {said} s and the projections for {usual:g} s: hot pixels and dark current are "
-            "not the same. Take darks with the projections' exposure.",
+            f"The darks were exposed for {seconds} s and the projections for {usual:g} s: hot pixels and dark current "
+            "are not the same. Take darks with the projections' exposure.",
         )
 
 
@@ -257,8 +257,8 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and source.emission is None and (said := _not_line_integrals(source)):
-        yield Finding("error", "quantity", said)
+    if source.quantity == "line_integrals" and source.emission is None and (problem := _not_line_integrals(source)):
+        yield Finding("error", "quantity", problem)
     elif source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
@@ -316,15 +316,15 @@ def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]
     rows, cols = (n // block for n in source.shape)
     darks = np.flatnonzero(source.image_key == FrameKind.DARK)[:1]
     dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
-    found = []
+    bits = []
     for view in views.tolist():
         image = read_known(source, [view])[0].astype(np.float64)
         if view in source.unreadable or not np.isfinite(image).all():
             continue
         image = image if source.quantity == "line_integrals" else image - dark
         coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
-        found.append(coarse)
-    depths = np.array(found).reshape(-1, rows, cols)
+        bits.append(coarse)
+    depths = np.array(bits).reshape(-1, rows, cols)
     if source.quantity == "line_integrals" or not len(depths):
         return depths
     return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))
@@ -361,9 +361,9 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
     if height is None:
         return
     if width is None or not 0.01 < height / width < 100:
-        said = "unknown" if width is None else f"{width:g} mm"
+        width_text = "unknown" if width is None else f"{width:g} mm"
         yield Finding(
-            "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {said}. That cannot be."
+            "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {width_text}. That cannot be."
         )
     elif source.cone is not None:
         yield Finding(
@@ -384,12 +384,12 @@ def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
     if source.part_starts.size > 1:
         return
-    if (found := joined_file_of(source.path)) is not None and is_joined(found[0]):
-        joined, n = found
+    if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):
+        joined, n = joined_file
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
     elif others := other_parts(source.path):
-        said = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
-        yield Finding("warning", "parts", f"{said}: {to_join(run_of(source.path.resolve().parent))}.")
+        sentence = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
+        yield Finding("warning", "parts", f"{sentence}: {to_join(run_of(source.path.resolve().parent))}.")
 
 
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
@@ -398,7 +398,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     angles_spread,
     angles_seen,
     angles_in_order,
-    quantity_said,
+    quantity_stated,
     references_present,
     exposures_agree,
     pixels_measured,

@@ -42,13 +42,13 @@ def format_of(path: Path) -> VolumeFormat:
     suffix = path.suffix.lower()
     if not path.name or (not suffix and path.name.startswith(".")):
         raise ValueError(f"{str(path)!r} names no file and no folder for a volume; expected such as volume.h5.")
-    found = next((kind for kind in formats() if suffix in kind.suffixes), None)
-    if found is None:
+    kind_of_file = next((kind for kind in formats() if suffix in kind.suffixes), None)
+    if kind_of_file is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
         raise ValueError(
             f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}."
         )
-    return found
+    return kind_of_file
 
 
 def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
@@ -96,11 +96,11 @@ def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
 def volume_format(path: Path) -> VolumeFormat | None:
     """The format of a volume that this program wrote, or of an .npy that is no scan, or of a NeXus file that plots one;
     None for scans and all else."""
-    found = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
+    kind_of_file = next((kind for kind in (*formats(), NexusVolume()) if kind.holds(path)), None)
     # Voxels alone say nothing of where they come from: a reader of scans goes first.
-    if isinstance(found, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
+    if isinstance(kind_of_file, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
         return None
-    return found
+    return kind_of_file
 
 
 def whole_volume(

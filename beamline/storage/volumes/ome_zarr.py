@@ -122,11 +122,11 @@ class _Scale:
 
 
 def _opened(path: Path, name: str) -> _Chunks:
-    said = json.loads(bytes_below(path, f"{name}/{_META}", SETTINGS))
-    if (codecs := [str(each["name"]) for each in said["codecs"]]) != ["bytes"]:
+    metadata = json.loads(bytes_below(path, f"{name}/{_META}", SETTINGS))
+    if (codecs := [str(each["name"]) for each in metadata["codecs"]]) != ["bytes"]:
         raise ValueError(f"its chunks are encoded by {', '.join(codecs)}, and only plain ones are read")
-    chunk = shape_of(said["chunk_grid"]["configuration"]["chunk_shape"], "chunk")
-    return _Chunks(path, name, shape_of(said["shape"]), chunk, dtype_of(said["data_type"]))
+    chunk = shape_of(metadata["chunk_grid"]["configuration"]["chunk_shape"], "chunk")
+    return _Chunks(path, name, shape_of(metadata["shape"]), chunk, dtype_of(metadata["data_type"]))
 
 
 @dataclass(frozen=True)

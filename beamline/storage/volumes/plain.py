@@ -53,10 +53,10 @@ class Nrrd:
     def open(self, path: Path) -> Iterator[ReconRecord]:
         header, begin = _header(path)
         fields = dict(line.split(b": ", 1) for line in header.splitlines() if b": " in line and b":=" not in line)
-        said = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
+        notes = [line.removeprefix(_KEY) for line in header.splitlines() if line.startswith(_KEY)]
         kinds = {name.encode(): bits for bits, name in _TYPES.items()}
         try:
-            facts = marked(_unescaped(said[0])) if len(said) == 1 else None
+            facts = marked(_unescaped(notes[0])) if len(notes) == 1 else None
             if facts is None:
                 raise ValueError(f"its field {_KEY.decode()} is not that of this program")
             shape = shape_of([int(n) for n in fields[b"sizes"].split()][::-1])

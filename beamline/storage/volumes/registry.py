@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from drivers.plugins import plugins
+from splatline.registry import Registry
 
 if TYPE_CHECKING:
     from beamline.storage.volumes.base import VolumeFormat
@@ -43,7 +43,7 @@ REGISTRY = {
 
 
 @cache
-def entries() -> dict[str, FormatEntry]:
+def entries() -> Registry[FormatEntry]:
     """The formats of this package and of other packages, by name."""
     taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
 
@@ -56,7 +56,7 @@ def entries() -> dict[str, FormatEntry]:
         taken.update(suffixes)
         return FormatEntry(kind.__module__, kind.__name__, suffixes)
 
-    return {**REGISTRY, **plugins("volume_format", REGISTRY, made)}
+    return Registry("volume_format", REGISTRY, made)
 
 
 @cache

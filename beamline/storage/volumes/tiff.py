@@ -58,8 +58,8 @@ class TiffVolume:
                 shape = shape_of(facts.get("shape"))
                 values: NDArray[Any] = tifffile.memmap(path, mode="r").reshape(shape)
                 dtype_of(values.dtype.str)
-            if complaints.said or pages != shape[0]:
-                raise ValueError(f"{pages} of {shape[0]} slices, {'; '.join(complaints.said)}")
+            if complaints.messages or pages != shape[0]:
+                raise ValueError(f"{pages} of {shape[0]} slices, {'; '.join(complaints.messages)}")
         except UNREADABLE as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
         yield record_of(path, facts, values)
@@ -88,8 +88,8 @@ class TiffFolderVolume:
         facts = _facts(_slice(path, 0))
         assert facts is not None
         try:
-            said = facts.get("shape")
-            shape = shape_of([facts.get("slices"), *(said[-2:] if isinstance(said, list) else ())])
+            stated_shape = facts.get("shape")
+            shape = shape_of([facts.get("slices"), *(stated_shape[-2:] if isinstance(stated_shape, list) else ())])
         except ValueError as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it was changed.") from error
         there = {item.name for item in path.iterdir()}
@@ -132,12 +132,12 @@ def _slice(folder: Path, z: int) -> Path:
 def _facts(path: Path) -> dict[str, Any] | None:
     try:
         with Complaints(), tifffile.TiffFile(path) as tif:
-            return marked(_said(tif))
+            return marked(_note(tif))
     except (*UNREADABLE, ElementTree.ParseError):
         return None
 
 
-def _said(tif: tifffile.TiffFile) -> str:
+def _note(tif: tifffile.TiffFile) -> str:
     """Where our facts stand: in ImageJ's information, OME's description, or the description of a slice."""
     if tif.is_imagej:
         return str((tif.imagej_metadata or {}).get("Info", ""))

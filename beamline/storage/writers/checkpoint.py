@@ -64,9 +64,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
     try:
         with opened_whole(path) as file:
             require_harmless(file)
-            said = file.attrs.get("format")
-            if said != _FORMAT:
-                raise KeyError(f"its format is {said!r}, expected {_FORMAT!r}")
+            format_of_file = file.attrs.get("format")
+            if format_of_file != _FORMAT:
+                raise KeyError(f"its format is {format_of_file!r}, expected {_FORMAT!r}")
             kept = Checkpoint(
                 {name: np.asarray(node[()]) for name, node in file["state"].items()},
                 {name: value_of(node) for name, node in file["made_from"].items()},

@@ -67,4 +67,4 @@ def _rows(file: h5py.File) -> dict[str, NDArray[np.intp]]:
     """Rows of each dataset of the view."""
     kinds = file[layout.KIND][: int(file[layout.COMMITTED][()])]
     rows = {name: np.flatnonzero(kinds == kind) for kind, name in NAMES.items()}
-    return {name: found for name, found in rows.items() if found.size}
+    return {name: rows_of_kind for name, rows_of_kind in rows.items() if rows_of_kind.size}

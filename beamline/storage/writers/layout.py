@@ -257,8 +257,8 @@ def _facts(file: h5py.File, info: ScanInfo) -> None:
     for device, description in info.devices.items():
         group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
         group.attrs["NX_class"] = "NXcollection"
-        for key, said in description.items():
-            group[key.replace("/", "_")] = said
+        for key, fact in description.items():
+            group[key.replace("/", "_")] = fact
 
 
 def _columns(

@@ -146,9 +146,9 @@ def open_partial(path: Path) -> PartialVolume:
             name: np.memmap(path, item.dtype, "r+", item.id.get_offset(), item.shape or (1,))
             for name, item in ((name, file[place]) for name, place in _PLACES.items())
         }
-    found = PartialVolume(path, slabs, made_from, kept, maps, lock)
-    found._take_out()
-    return found
+    volume = PartialVolume(path, slabs, made_from, kept, maps, lock)
+    volume._take_out()
+    return volume
 
 
 def can_become(target: Path) -> bool:

@@ -109,7 +109,7 @@ class Rows:
         if row != self._first + len(self._said):
             self.flush()
             self._first = row
-        said = {
+        values = {
             layout.IMAGE_KEY: image_key_of(record.kind),
             layout.KIND: int(record.kind),
             layout.COUNT_TIME: record.exposure,
@@ -127,7 +127,7 @@ class Rows:
         for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
-        self._said.append({path: said[path] for path in self._columns})
+        self._said.append({path: values[path] for path in self._columns})
         if record.replaces >= 0:
             self.flush()
             for path in (layout.IMAGE_KEY, layout.KIND):

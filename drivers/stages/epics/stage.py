@@ -48,8 +48,8 @@ class MotorStatus:
     @property
     def fault(self) -> tuple[str, str]:
         """What MSTA says is wrong and what to do; empty texts without a fault."""
-        found = [said for bit, said in FAULTS.items() if self.bits & bit]
-        return (", ".join(text for text, _ in found), found[0][1]) if found else ("", "")
+        faults = [fault_of_bit for bit, fault_of_bit in FAULTS.items() if self.bits & bit]
+        return (", ".join(text for text, _ in faults), faults[0][1]) if faults else ("", "")
 
 
 class EpicsStage(LineStage):
@@ -245,10 +245,10 @@ class EpicsStage(LineStage):
 
     def _read(self, *suffixes: str) -> list[PvValue]:
         """Values that the IOC vouches for."""
-        found = self._channel.read(*suffixes)
-        for suffix, value in zip(suffixes, found, strict=True):
+        values = self._channel.read(*suffixes)
+        for suffix, value in zip(suffixes, values, strict=True):
             refuse_invalid(self.name, self._channel.name + suffix, value, "Whether it moves is not known")
-        return found
+        return values
 
     def _write(self, suffix: str, value: float) -> None:
         self._channel.write(suffix, value)
@@ -261,11 +261,11 @@ class EpicsStage(LineStage):
     def _refuse_unless_it_would_go(self) -> None:
         """Refuses a record that takes a place without a move: stopped by SPMG, or to be redefined by SET."""
         for suffix, wanted in ((".SPMG", GO), (".SET", USE)):
-            (found,) = self._read(suffix)
-            if found.label != wanted:
+            (field_value,) = self._read(suffix)
+            if field_value.label != wanted:
                 raise DeviceRefused(
                     self.name,
-                    f"{self._channel.name}{suffix} is {found}, so that the record would not move",
+                    f"{self._channel.name}{suffix} is {field_value}, so that the record would not move",
                     expected=wanted,
                     advice="Set it in the record's own screen; somebody may have stopped this motor on purpose",
                     state="Nothing has moved",

@@ -262,18 +262,18 @@ class HomeSearch:
         Raises:
             DeviceError: the search ended without the switch, or was stopped.
         """
-        found = self._channel.home() if self._found is None else self._found
-        if found is None or self._cancelled or status.stopped:
+        home = self._channel.home() if self._found is None else self._found
+        if home is None or self._cancelled or status.stopped:
             raise self._failed(status)
-        if self._found is None and status.counts != found:
-            self._found = found
+        if self._found is None and status.counts != home:
+            self._found = home
             try:
-                self._channel.go_home(found)
+                self._channel.go_home(home)
             finally:
                 if self._cancelled:  # the stop may have gone out just before the move
                     self._channel.stop(hard=False)
             return True
-        if status.counts != found:
+        if status.counts != home:
             raise self._failed(status)
         self._channel.preset(self._home)
         return False

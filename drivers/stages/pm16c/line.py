@@ -53,10 +53,10 @@ class PM16CLine:
         """Send a setting and check that the reply to `query`, of the form `form`, reads `wanted`."""
         for _ in range(2):
             self.send(command)
-            found = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
-            if found == wanted:
+            value = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
+            if value == wanted:
                 return
-        raise self.not_followed(command, str(found), str(wanted))
+        raise self.not_followed(command, str(value), str(wanted))
 
     def until(self, look: Callable[[], T], good: Callable[[T], bool]) -> T:
         """The first good reply, or the last one within the time for a setting to take effect."""

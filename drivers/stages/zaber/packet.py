@@ -150,11 +150,12 @@ def reply_of(match: re.Match[str]) -> Reply:
 def meaning_of(flags: tuple[str, ...]) -> Meaning | None:
     """The gravest of the flags that is a fault or ends moves; None without one."""
     known = FAULTS | ENDINGS
-    found = [flag for flag in flags if flag in known or flag.startswith("F")]
-    if not found:
+    serious = [flag for flag in flags if flag in known or flag.startswith("F")]
+    if not serious:
         return None
     meanings = [
-        known.get(flag, Meaning("a fault that this driver does not know", "See the vendor's manual")) for flag in found
+        known.get(flag, Meaning("a fault that this driver does not know", "See the vendor's manual"))
+        for flag in serious
     ]
-    text = ", ".join(f"{meaning.text} ({flag})" for flag, meaning in zip(found, meanings, strict=True))
+    text = ", ".join(f"{meaning.text} ({flag})" for flag, meaning in zip(serious, meanings, strict=True))
     return Meaning(text, meanings[0].advice)

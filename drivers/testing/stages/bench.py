@@ -97,9 +97,9 @@ Build = Callable[..., StageBench]
 
 def emitted(line: Cable, clock: Clock) -> list[EmittedPulse]:
     """The pulses that have come out of a cable by now, in their order."""
-    found: list[EmittedPulse] = []
+    pulses: list[EmittedPulse] = []
     after = -math.inf
     while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():
-        found.append(pulse)
+        pulses.append(pulse)
         after = pulse.time
-    return found
+    return pulses

@@ -183,7 +183,7 @@ def render_view(
         exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
     if exact.size:
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = CpuRays(*some, projection, shape, faint, sigmas, a.kernel)
+        rays = CpuRays(some, projection, shape, faint, sigmas, a.kernel)
         rays.add_to(picture)
     return RenderedView(picture, active, projection, length, buffers, exact, rays)
 
@@ -192,4 +192,4 @@ def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layo
     """Layout of Gaussians on a grid, for filling it and its backward pass; `faint` is a density."""
     z, y, x = grid.first
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas, active.kernel)
+    return Layout(parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas, active.kernel)

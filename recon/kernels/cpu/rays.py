@@ -317,18 +317,19 @@ class CpuRays:
 
     def __init__(
         self,
-        means: F32,
-        scales: F32,
-        rotations: F32,
-        densities: F32,
+        parameters: tuple[F32, F32, F32, F32],
         camera: RayCamera,
         shape: tuple[int, int],
         faint: float,
         cut: float,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:
-        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
-        self.parameters, self.camera, self._kernel = (means, scales, rotations, densities), camera, kernel
+        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them.
+
+        `parameters` are means [n, 3], standard deviations [n, 3], rotations [n, 9] and densities [n].
+        """
+        self.parameters, self.camera, self._kernel = parameters, camera, kernel
+        densities = parameters[3]
         self.table = footprint_table(densities.shape[0])
         footprints(*self.parameters, camera, faint, cut, self.table, kernel=kernel)
         self.terms = np.empty((densities.shape[0], 9))

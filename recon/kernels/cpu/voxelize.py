@@ -262,10 +262,7 @@ class Layout:
 
     def __init__(
         self,
-        means: F32,
-        scales: F32,
-        rotations: F32,
-        densities: F32,
+        parameters: tuple[F32, F32, F32, F32],
         origin: tuple[float, float, float],
         spacing: float | tuple[float, float, float],
         shape: tuple[int, int, int],
@@ -273,13 +270,16 @@ class Layout:
         cut: float,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:
-        """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
+        """`parameters` are means [n, 3] mm, standard deviations [n, 3] mm, rotations [n, 9] and densities [n].
+
+        `origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
 
         Gaussians are cut off where they fall below `faint` (a density). They are also cut off at `cut` standard
         deviations; compact kernels at their own end, if they are above `faint` anywhere.
         """
+        means, scales, _, densities = parameters
         n, cut = densities.shape[0], kernel.reach(cut)
-        self.parameters, self.shape, self._kernel = (means, scales, rotations, densities), shape, kernel
+        self.parameters, self.shape, self._kernel = parameters, shape, kernel
         self._spacing = np.broadcast_to(np.asarray(spacing, np.float64), 3).copy()
         corner = np.asarray(origin, np.float64)
         edge = self._spacing[::-1]

@@ -69,7 +69,7 @@ class GpuView:
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
                 means, scales, rotations, densities = (array[exact] for array in run.active)
-                rays = GpuRays(means, scales, rotations, densities, geometry, view, faint, cut, run.kernel)
+                rays = GpuRays((means, scales, rotations, densities), geometry, view, faint, cut, run.kernel)
                 rays.add_to(self.image)
                 self._rays = (exact, rays)
 

@@ -241,11 +241,15 @@ class GpuRays:
     """Gaussians (one or more) in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(
-        self, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
-        geometry: Geometry, view: int, faint: float, cut: float, kernel: Kernel = Kernel.GAUSSIAN,
+        self, parameters: tuple[Tensor, Tensor, Tensor, Tensor], geometry: Geometry, view: int, faint: float,
+        cut: float, kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:  # fmt: skip
-        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them."""
-        self.parameters, self.geometry, self.view = (means, scales, rotations, densities), geometry, view
+        """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them.
+
+        `parameters` are means [n, 3], standard deviations [n, 3], rotations [n, 9] and densities [n].
+        """
+        self.parameters, self.geometry, self.view = parameters, geometry, view
+        means, _, _, densities = parameters
         self.kernel, self.footprints = kernel, footprints(*self.parameters, geometry, view, faint, cut, kernel=kernel)
         n = densities.shape[0]
         axes, focal, sod = beam_of(geometry, view)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
@@ -10,6 +9,7 @@ from typing import ClassVar, Self
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.voxels.held_out import HeldOutTrial, choose_weight
@@ -45,10 +45,7 @@ class FistaTv:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        if self.tv_weight is not None and not 0 <= self.tv_weight < math.inf:
-            raise ValueError(f"tv_weight must be finite and 0 or more, got {self.tv_weight}")
-        if self.subsets < 1 or self.tv_steps < 1:
-            raise ValueError(f"subsets and tv_steps must be 1 or more, got {self.subsets} and {self.tv_steps}")
+        check_settings(self, whole={"subsets": 1, "tv_steps": 1}, least={"tv_weight": 0.0})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)

@@ -94,7 +94,7 @@ def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subset
     def go_on(progress: Progress) -> bool:
         if control.on_progress is not None:
             control.on_progress(progress)
-        return control.should_stop is None or not control.should_stop()
+        return not control.stop()
 
     def tried(done: int) -> bool:
         seconds = control.now() - begin

@@ -10,6 +10,7 @@ from typing import ClassVar, Self
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.voxels.held_out import choose_weight
@@ -48,8 +49,7 @@ class OsSirtTv:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        if self.tv_weight is not None and not 0 <= self.tv_weight < math.inf:
-            raise ValueError(f"tv_weight must be finite and 0 or more, got {self.tv_weight}")
+        check_settings(self, least={"tv_weight": 0.0})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -12,6 +11,7 @@ from recon.base.arrays import F32, F64
 from recon.base.empirical import FIRST_THRESHOLD, TRIAL_STEPS, TRIAL_SWEEPS, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
@@ -52,8 +52,7 @@ class PnpDct:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        if self.patch_threshold is not None and not 0 <= self.patch_threshold < math.inf:
-            raise ValueError(f"patch_threshold must be finite and 0 or more, got {self.patch_threshold}")
+        check_settings(self, least={"patch_threshold": 0.0})
 
     @property
     def first_sweeps(self) -> int:

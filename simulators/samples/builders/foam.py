@@ -80,12 +80,12 @@ class Foam(PieceBuilder):
             matter = Box(self.edges, 1.0)
         gap, largest = self.gap_um * 1e-3, self.largest_um * 0.5e-3
         radii = np.minimum(room - gap, largest)
-        found = holes(points, radii, self.smallest_um * 0.5e-3, gap, self.n_holes)
+        centres = holes(points, radii, self.smallest_um * 0.5e-3, gap, self.n_holes)
         return (
             Piece(matter, "matter"),
             *(
                 Piece(Ellipsoid((radius,) * 3, 1.0, (px, py, pz)), "hole", "matter")
-                for px, py, pz, radius in found.tolist()
+                for px, py, pz, radius in centres.tolist()
             ),
         )
 

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar, Protocol
 from pydantic import Field
 
 from simulators.samples.bodies.solids import LEAST, MOST, Solid
+from splatline.registry import unknown
 
 Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
 Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
@@ -57,5 +58,5 @@ def check_roles(settings: PieceBuilder) -> None:
     """Raises ValueError if the scene names a role that the phantom lacks."""
     roles = settings.default_materials
     for key, named in (("made_of", settings.made_of), ("attenuation", settings.attenuation)):
-        if unknown := [role for role in named if role not in roles]:
-            raise ValueError(f"{key}: {unknown[0]!r} is no part of this phantom; its parts are {', '.join(roles)}")
+        if others := [role for role in named if role not in roles]:
+            raise ValueError(f"{key}: {unknown('part of this phantom', others[0], roles)}")

@@ -156,9 +156,14 @@ def _of_materials(
 
     palette = palette_of(f"{where}.materials", materials)
     used = {role for piece in pieces for role in (piece.role, piece.instead_of) if role is not None}
-    found = {role: palette(material_of[role]) for role in sorted(used)}
+    material_by_role = {role: palette(material_of[role]) for role in sorted(used)}
     parts = [
-        Part(piece.solid, found[piece.role], found[piece.instead_of] if piece.instead_of else None, piece.role)
+        Part(
+            piece.solid,
+            material_by_role[piece.role],
+            material_by_role[piece.instead_of] if piece.instead_of else None,
+            piece.role,
+        )
         for piece in pieces
     ]
     return sample_of(parts, beam, palette.filters)

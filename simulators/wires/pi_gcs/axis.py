@@ -84,10 +84,10 @@ class GcsAxis:
         self._clock = clock
         firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
         self._wired = WiredOutput(wired, line, firmware, self.per_degree)
-        found = round(build.found_at * self.per_degree)
-        self._zero = 0 if build.referenced else found
+        reference = round(build.found_at * self.per_degree)
+        self._zero = 0 if build.referenced else reference
         self._target = 0.0
-        self._moves = deque([TrapezoidMove(clock.now(), found, found, ())], maxlen=MOVES_REMEMBERED)
+        self._moves = deque([TrapezoidMove(clock.now(), reference, reference, ())], maxlen=MOVES_REMEMBERED)
         self._at_end: Callable[[], None] | None = None
         self._referencing = False
         self._hit = 0

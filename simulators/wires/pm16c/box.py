@@ -216,8 +216,8 @@ class PM16CBox:
 
     def home(self, c: str) -> str:
         """The reply to SHP?x."""
-        found = self.channels[c].home.found()
-        return "NO H.P" if found is None else f"{found:+08d}"
+        home_place = self.channels[c].home.found()
+        return "NO H.P" if home_place is None else f"{home_place:+08d}"
 
     def preset(self, c: str, count: int) -> None:
         """Set the count of the present position to `count`."""

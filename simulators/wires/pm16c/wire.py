@@ -160,8 +160,8 @@ class PM16CController:
 
     def _do(self, line: bytes) -> None:
         text = line.decode("ascii", errors="replace")
-        if (found := _find(QUERIES, text)) is not None:
-            self._reply(found(self.box))
+        if (answer := _find(QUERIES, text)) is not None:
+            self._reply(answer(self.box))
         elif (act := _find(ALWAYS, text) or (_find(REMOTE_ONLY, text) if self.box.remote else None)) is not None:
             try:
                 act(self.box)

@@ -196,13 +196,13 @@ class Triggers:
 
     def _next(self) -> tuple[float, float, Trigger | None] | None:
         """(time, position, trigger) of the next event; without a trigger for a scheduled command."""
-        found: list[tuple[float, float, Trigger | None]] = []
+        events: list[tuple[float, float, Trigger | None]] = []
         if self.queue:
-            found.append((self.queue[0][0], self.move.position(self.queue[0][0]), None))
+            events.append((self.queue[0][0], self.move.position(self.queue[0][0]), None))
         for trigger in self.triggers:
             if trigger.left and (event := self._change(trigger)) is not None:
-                found.append((*event, trigger))
-        return min(found, key=lambda event: event[0], default=None)
+                events.append((*event, trigger))
+        return min(events, key=lambda event: event[0], default=None)
 
     def _change(self, trigger: Trigger) -> tuple[float, float] | None:
         """When and where an enabled trigger's condition changes next."""

@@ -64,15 +64,15 @@ class PacketReader:
 
     def feed(self, data: bytes) -> list[Command | Malformed]:
         self._bytes += data
-        found: list[Command | Malformed] = []
+        packets: list[Command | Malformed] = []
         while (end := LINE_ENDS.search(self._bytes)) is not None:
             line = bytes(self._bytes[: end.start()])
             del self._bytes[: end.end()]
             if (packet := self._packet(line)) is not None:
-                found.append(packet)
+                packets.append(packet)
         if len(self._bytes) > LONGEST_PACKET:
             del self._bytes[: -LONGEST_PACKET - 1]  # too long already: the rest is dropped
-        return found
+        return packets
 
     def _packet(self, line: bytes) -> Command | Malformed | None:
         if not line.startswith(b"/") or len(line) > LONGEST_PACKET or not line.isascii():

@@ -67,7 +67,7 @@ def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
 
 def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Path]) -> None:
     bent, straight = (_prepared(scans[name]) for name in ("bent", "straight"))
-    assert "taken off" in bent.done["background"].said and straight.done["background"].said == ""
+    assert "taken off" in bent.done["background"].sentence and straight.done["background"].sentence == ""
     left = bent.projections.data - straight.projections.data
     noise = float(np.std(left[:, :8]))
     assert np.abs(left.mean(axis=0)).max() < 0.01 and noise < 0.02
@@ -89,7 +89,7 @@ def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path])
     buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
     parts = _prepared(scans["bent"], buffer=buffer)
     np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
-    assert parts.done["background"].said == whole.done["background"].said
+    assert parts.done["background"].sentence == whole.done["background"].sentence
 
 
 def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:

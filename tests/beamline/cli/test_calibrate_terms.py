@@ -92,7 +92,7 @@ def test_soft_tissue_beside_bone_in_a_narrow_field_behind_a_bent_beam(scans: dic
 def test_a_straight_beam_stays_as_it_is_and_says_so(scans: dict[str, Path]) -> None:
     plain, learnt = _prepared(scans["straight"]), _prepared(scans["straight"], "background")
     np.testing.assert_array_equal(learnt.projections.data, plain.projections.data)
-    assert "views held out confirm none" in learnt.done["calibrate"].said
+    assert "views held out confirm none" in learnt.done["calibrate"].sentence
 
 
 @pytest.mark.slow

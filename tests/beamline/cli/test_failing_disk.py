@@ -44,6 +44,7 @@ FOLDERS = {  # of results, which keep those of the trials that were done: so man
     "study fixed-views views.h5 -m fbp -m sirt -o out/o": 2,
 }
 LOG = "recon scan.h5 -m fbp --no-report --log out/o.txt -o out/o.h5"
+FORKS = {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "NUMBA_THREADING_LAYER": "workqueue"}  # it outlives a fork
 POINTS = 6  # writes of each fault; there are up to 315
 
 
@@ -75,7 +76,7 @@ def _swept(inputs: Path, commands: Iterable[str], watched: str = "/out/") -> lis
     """Of each command the run without a fault, and those with one."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *commands],
-        env=os.environ | faulty_disk.environment(watched) | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        env=os.environ | faulty_disk.environment(watched) | FORKS,
         cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=800, check=True,
     )  # fmt: skip
     lines = [json.loads(line) for line in done.stdout.splitlines()]

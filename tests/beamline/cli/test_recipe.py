@@ -80,8 +80,8 @@ def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("methods: fbp\n", "'methods' is no option of a recipe; expected method"),
-        ("output: v.h5\n", "'output' is no option of a recipe"),
+        ("methods: fbp\n", "option of a recipe 'methods' is unknown; legal: method"),
+        ("output: v.h5\n", "option of a recipe 'output' is unknown"),
         ("method: [fbp, r2]\n", "expected one value"),
         ("method: r3\n", "r3"),
         ("rows: 5\n", "FIRST:END"),

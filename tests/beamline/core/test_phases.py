@@ -6,18 +6,11 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.core.phases import Phases
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.time = 100.0
-
-    def now(self) -> float:
-        return self.time
+from tests.clock import SteppedClock
 
 
 def test_the_seconds_of_phases_add_up_to_the_time() -> None:
-    clock, said = Clock(), list[Event]()
+    clock, said = SteppedClock(100.0), list[Event]()
     phases = Phases(said.append, clock)
     for name, seconds in (("reading", 3.0), ("axis", 0.25), ("reading", 2.0)):
         phases.enter(name)
@@ -30,7 +23,7 @@ def test_the_seconds_of_phases_add_up_to_the_time() -> None:
 
 
 def test_a_phase_says_how_far_it_is_at_most_a_few_times_a_second() -> None:
-    clock, said = Clock(), list[Event]()
+    clock, said = SteppedClock(100.0), list[Event]()
     phases = Phases(said.append, clock)
     phases.enter("reading")
     for n in range(1, 101):
@@ -45,7 +38,7 @@ def test_a_phase_says_how_far_it_is_at_most_a_few_times_a_second() -> None:
 
 def test_a_phase_with_nothing_done_says_no_more_than_that_it_has_begun() -> None:
     said = list[Event]()
-    phases = Phases(said.append, Clock())
+    phases = Phases(said.append, SteppedClock(100.0))
     phases.enter("axis", "guesses")
     phases.progress(0, 100)
     assert [(event.data["n"], event.data["counted"]) for event in said] == [(0, "guesses")]

@@ -18,7 +18,7 @@ def said(frames: Iterable[Frame], **known: Any) -> tuple[str, ...]:
     for frame in frames:
         monitor, _ = watch.look(monitor, frame, digest(frame.counts, 65535, 4))
         aside = aside.with_frame(monitor.context)
-    return aside.said()
+    return aside.in_words()
 
 
 def test_a_scan_at_even_steps_with_flats_was_looked_at(fake: Any) -> None:

@@ -131,10 +131,10 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     errors = []
     for way in ("groups", "dynamic"):
         correction = ScanCorrection(source, Selection(steps=(Flats(way),)), pytest.fail)  # type: ignore[arg-type]
-        assert bool(correction.done["flats"].said) is (way == "dynamic")
+        assert bool(correction.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "components of their changes" in correction.done["flats"].said
+    assert "components of their changes" in correction.done["flats"].sentence
     few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
     with pytest.raises(ConfigError, match="--flat-fields dynamic: array: dynamic flats need at least 4 flats, got 3"):
         ScanCorrection(few, Selection(steps=(Flats("dynamic"),)), lambda _: None)  # type: ignore[arg-type]
@@ -158,7 +158,7 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
         correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
-    assert correction.done["flats"].said == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="no ring current for some views or flats"):
         ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]

@@ -176,7 +176,7 @@ def test_views_added_are_the_counts_of_both(pet: Path) -> None:
 def test_a_trade_off_reconstructs_counts(pet: Path, tmp_path: Path) -> None:
     """By the commands, beside the truth: osem of the trade-off is osem of `recon`."""
     truth = str(pet.with_name("truth.h5"))
-    made = _beamline("tradeoff", str(pet), "--methods", "osem,fbp", "--truth", truth, "-o", str(tmp_path / "t"))
+    made = _beamline("tradeoff", str(pet), "--methods", "osem", "--truth", truth, "-o", str(tmp_path / "t"))
     assert made.exit_code == 0, made.output
     trials = json.loads((tmp_path / "t/tradeoff.json").read_text(encoding="utf-8"))["trials"]
     base = next(one for one in trials if one["trial"]["method"] == "osem" and one["trial"]["group"] == "method")

@@ -75,8 +75,8 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
     with open_scan(path) as source:
         found = statistics_of(source, lambda n, of: None)
         photons = (found[1].mean - found[0].mean) * 0.25
-        light, dose = light_of(source, found, LightAsked(0.25, "water")).said()
-        assert light_in(source, LightAsked(0.25, "water")).said() == [light, dose]
+        light, dose = light_of(source, found, LightAsked(0.25, "water")).in_words()
+        assert light_in(source, LightAsked(0.25, "water")).in_words() == [light, dose]
     views = SCAN.angles.size
     assert light == f"{photons:.4g} photons a pixel and view in the open beam, {photons * views:.4g} in {views} views"
     expected = absorbed_dose("water", 20.0, photons * views / 0.002**2)

@@ -37,21 +37,11 @@ from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.clock import SteppedClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
-
-
-class Ticking:
-    """A clock by which every look takes as long."""
-
-    def __init__(self, tick: float) -> None:
-        self.time, self.tick = 100.0, tick
-
-    def __call__(self) -> float:
-        self.time += self.tick
-        return self.time
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +55,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
 def _spend(
     prepared: PreparedProjections,
     budget: float,
-    now: Ticking,
+    now: SteppedClock,
     warned: list[str] | None = None,
     methods: Sequence[Method] = (R2(), Fbp()),
 ) -> Budgeted:
@@ -84,7 +74,7 @@ def test_the_time_is_used_and_not_exceeded(
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
-    done = _spend(prepared, budget, Ticking(0.01))
+    done = _spend(prepared, budget, SteppedClock(100.0, 0.01))
     assert done.choice.is_gaussian_fit
     assert 0.9 * budget < done.seconds <= budget
     assert done.result.volume.grid == Grid.matching(prepared.geometry)
@@ -105,7 +95,7 @@ def test_iterations_on_voxels_take_no_sample_that_is_wider_than_the_field(
     narrow = replace(prepared, projections=inner, geometry=cut, held_out=None)
     methods = (FistaTv(), R2(), Fbp())
     for data, taken in ((prepared, True), (narrow, False)):
-        done = within(4.0, data, methods, 0, RunControl(now=Ticking(0.01)), lambda said: None, 1)
+        done = within(4.0, data, methods, 0, RunControl(now=SteppedClock(100.0, 0.01)), lambda said: None, 1)
         assert ("fista-tv" in done.because) is taken and done.choice.binning == 1
 
 
@@ -113,7 +103,7 @@ def test_a_slow_machine_takes_fbp_of_binned_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(prepared, 5.0, Ticking(0.01))
+    done = _spend(prepared, 5.0, SteppedClock(100.0, 0.01))
     assert not done.choice.is_gaussian_fit and done.choice.binning == 2
     assert done.result.volume.grid.shape == (3, 20, 20)
     assert "binned 2 x 2" in done.summary(5.0) and done.summary(5.0).startswith("fbp")
@@ -123,7 +113,7 @@ def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is measured once on a machine is not counted."""
-    clock = Ticking(0.01)
+    clock = SteppedClock(100.0, 0.01)
 
     def slow(*_: object) -> Speeds:
         clock.time += 7.0
@@ -148,7 +138,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))
     monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
-    done = _spend(prepared, 60.0, Ticking(0.1), methods=(R2(),))
+    done = _spend(prepared, 60.0, SteppedClock(100.0, 0.1), methods=(R2(),))
     assert done.result.history[-1].step == 7 and done.seconds < 30
 
 
@@ -158,7 +148,7 @@ def test_the_shortest_fit_is_said_to_be_late_too(
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     warned: list[str] = []
-    _spend(_cone(prepared, 3.0), 0.001, Ticking(0.01), warned)
+    _spend(_cone(prepared, 3.0), 0.001, SteppedClock(100.0, 0.01), warned)
     assert len(warned) == 1 and "the cheapest choice, r2, binned" in warned[0]
 
 
@@ -182,7 +172,7 @@ PACE = next(c.pace for c in CURVES if c.method == OsSirtTv.name and c.binning ==
 class Costly(OsSirtTv):
     """OS-SIRT-TV that takes its curve's pace an iteration on 64 rows; its volume is too large by a factor."""
 
-    clock: Ticking = field(default_factory=lambda: Ticking(0.0))
+    clock: SteppedClock = field(default_factory=lambda: SteppedClock(100.0))
     factor: float = 1.0
     ran: list[tuple[int, int]] = field(default_factory=list)
 
@@ -197,7 +187,7 @@ class Costly(OsSirtTv):
 def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_rest_of_the_time(
     high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = Ticking(0.0)
+    clock = SteppedClock(100.0)
     _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
     for factor, expected in ((1.0, "os-sirt-tv"), (3.0, "fbp")):
         costly = Costly(clock=clock, factor=factor)
@@ -218,18 +208,18 @@ def test_without_a_trial_the_curves_of_other_scans_decide(
     prepared: PreparedProjections, high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)
-    few = _spend(prepared, 20.0, Ticking(0.0), methods=(OsSirtTv(), Fbp()))
+    few = _spend(prepared, 20.0, SteppedClock(100.0), methods=(OsSirtTv(), Fbp()))
     assert few.result.method == "os-sirt-tv"
     assert few.because.endswith("nothing was tried: the scan has too few rows for a trial in this time")
     assert few.because.startswith("expected by other scans, dB above FBP: os-sirt-tv ")
-    clock = Ticking(0.0)
+    clock = SteppedClock(100.0)
     slow = Costly(clock=clock)
     monkeypatch.setattr(Costly, "run", lambda self, problem, control: _wait(clock, 12.0, problem))
     late = _spend(high, 20.0, clock, methods=(slow, Fbp()))
     assert late.because.endswith("too little time") and late.seconds >= 12.0
 
 
-def _wait(clock: Ticking, seconds: float, problem: ReconProblem) -> Reconstruction:
+def _wait(clock: SteppedClock, seconds: float, problem: ReconProblem) -> Reconstruction:
     clock.time += seconds
     return Reconstruction(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
 
@@ -238,7 +228,7 @@ def test_a_method_on_voxels_ends_in_time_with_what_it_has(
     high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 0.1, 1e6, 1.0, 1e6, 0.1)
-    done = _spend(high, 3.0, Ticking(0.1), methods=(FistaTv(),))
+    done = _spend(high, 3.0, SteppedClock(100.0, 0.1), methods=(FistaTv(),))
     last = done.result.history[-1]
     assert 1 < last.step < last.steps and done.seconds <= 3.5 and done.because == ""
     assert done.summary(3.0).startswith(f"fista-tv, {last.step} iterations: ")
@@ -264,7 +254,7 @@ def _cone(
 def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections) -> None:
     """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
     cone = _cone(prepared, 2 * np.pi)
-    done = _spend(cone, 8.0, Ticking(0.01))
+    done = _spend(cone, 8.0, SteppedClock(100.0, 0.01))
     grid = Grid.matching(cone.geometry)
     assert done.choice.is_gaussian_fit and done.result.volume.grid == grid
     truth = SCAN.truth(grid)
@@ -278,7 +268,7 @@ def test_a_cone_is_placed_as_its_parallel_likeness_is(
 ) -> None:
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     both = (prepared, _cone(prepared, 2 * np.pi))
-    counts = [_spend(views, 3.0, Ticking(0.01)).result.settings["gaussians_at_start"] for views in both]
+    counts = [_spend(views, 3.0, SteppedClock(100.0, 0.01)).result.settings["gaussians_at_start"] for views in both]
     assert counts[1] == pytest.approx(counts[0], rel=0.1) and min(counts) >= 500
 
 
@@ -286,13 +276,13 @@ def test_a_slow_machine_takes_fdk_of_a_cones_binned_pixels(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(_cone(prepared, 2 * np.pi), 5.0, Ticking(0.01))
+    done = _spend(_cone(prepared, 2 * np.pi), 5.0, SteppedClock(100.0, 0.01))
     assert done.summary(5.0).startswith("fbp") and done.result.volume.grid.shape == (3, 20, 20)
 
 
 def test_views_that_lean_have_a_direct_method(prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    assert _spend(_cone(prepared, 2 * np.pi, tilt=0.02), 5.0, Ticking(0.01)).result.method == "fbp"
+    assert _spend(_cone(prepared, 2 * np.pi, tilt=0.02), 5.0, SteppedClock(100.0, 0.01)).result.method == "fbp"
 
 
 def test_views_without_a_direct_method_get_the_shortest_fit(
@@ -300,7 +290,7 @@ def test_views_without_a_direct_method_get_the_shortest_fit(
 ) -> None:
     """Less than a short scan of a cone is for neither FBP nor FDK."""
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(_cone(prepared, 2.8), 5.0, Ticking(0.01))
+    done = _spend(_cone(prepared, 2.8), 5.0, SteppedClock(100.0, 0.01))
     assert done.choice.is_gaussian_fit and done.result.method == "r2" and done.choice.binning == 4
     assert done.result.history[-1].step > 0 and 0 < done.result.settings["gaussians_at_start"] < 100
     assert done.result.volume.data.max() > 0

@@ -62,11 +62,14 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     names = [event.event for event in events]
     assert names[0] == "state"
     assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
-    watch = f"open {tmp_path / 'recon.live.png'}: drawn anew about every {RHYTHM.snapshot:g} s"
+    watch = f"open {tmp_path / 'recon.live.png'}: slices from the eighth view on"
     assert watch in str(events[1].data["message"])
     assert '<a href="recon.live.png">' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert names.count("recon_started") == 1
     assert "snapshot" in names
+    drawn = [event.data for event in events if event.event == "slices"]
+    assert drawn[0]["n_views"] == 8 and drawn[-1]["n_views"] > 20
+    assert names.index("slices") < names.index("snapshot")
     assert names[-1] == "done"
     steps = [event.data for event in events if event.event == "progress" and not event.data.get("unit")]
     views = [step["n_views"] for step in steps]  # the sweeps of the finish follow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import in_time
-from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
+from beamline.reconstruct.in_time import fit_within, warnings_told
 from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
@@ -27,32 +26,12 @@ from recon.fields.methods import NAF
 from recon.prep.correct import Projections
 from recon.splatting.r2 import R2
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.clock import SteppedClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 40))
 SWEEP = 10.0  # s
-
-
-class At:
-    """A clock that shows one time."""
-
-    def __init__(self, time: float) -> None:
-        self.time = time
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds
-
-
-class Ticking(At):
-    """A clock that each look at it moves on by a tenth of a second."""
-
-    def now(self) -> float:
-        self.time += 0.1
-        return self.time
 
 
 def _prepared() -> PreparedProjections:
@@ -69,23 +48,23 @@ def sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(in_time, "first_sweep_seconds", lambda *_: SWEEP)
 
 
-def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, Deadline, list[str]]:
-    """What the fit gets, the deadline, and what was said."""
+def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, float, list[str]]:
+    """What the fit gets, what report and writing get, and what was said."""
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), Path("out.html") if report else None)
-    method, deadline = fit_within(
-        R2(seconds=seconds), _prepared(), target, (100.0, 0.0), At(100.0 + spent), said.append
+    method, before_report = fit_within(
+        R2(seconds=seconds), _prepared(), target, (100.0, 0.0), SteppedClock(100.0 + spent), said.append
     )
     assert method.seconds is not None
-    return method.seconds, deadline, said
+    return method.seconds, 100.0 + seconds - before_report.deadline, said
 
 
 @pytest.mark.usefixtures("sweeps")
 def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:
-    left, deadline, said = _within(100.0, spent=20.0)
+    left, after, said = _within(100.0, spent=20.0)
     measuring = SWEEP / 2 * 16 / VIEWS.n_views  # of sixteen views there, not back
-    assert left + 20 + measuring + deadline.after == pytest.approx(100)
-    assert 5 <= deadline.after <= 20 and said == []
+    assert left + 20 + measuring + after == pytest.approx(100)
+    assert 5 <= after <= 20 and said == []
     without_report, _, _ = _within(100.0, spent=20.0, report=False)
     assert without_report == pytest.approx(100 - 20 - measuring, abs=0.1)
 
@@ -101,15 +80,8 @@ def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> Non
 def test_a_method_without_a_start_is_told_of_none() -> None:
     said: list[str] = []
     target = OutputPaths(Path("out.h5"), None)
-    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), At(109.0), said.append)
+    fit_within(NAF(seconds=12.0), _prepared(), target, (100.0, 0.0), SteppedClock(109.0), said.append)
     assert len(said) == 1 and "nothing is left for the NAF method" in said[0] and "start" not in said[0]
-
-
-def test_a_deadline_leaves_time_for_what_ends_before_the_report() -> None:
-    clock = At(50.0)
-    deadline = Deadline(end=60.0, after=4.0, now=clock.now)
-    assert deadline.leaves(6.0) and not deadline.leaves(6.1)
-    assert Deadline().leaves(math.inf)
 
 
 def test_warnings_of_python_are_told_as_sentences() -> None:
@@ -121,7 +93,7 @@ def test_warnings_of_python_are_told_as_sentences() -> None:
 
 
 def _told(
-    folder: Path, method: R2, clock: At | SystemClock, stop: Callable[[], bool] = lambda: False
+    folder: Path, method: R2, clock: SteppedClock | SystemClock, stop: Callable[[], bool] = lambda: False
 ) -> tuple[list[Event], list[str]]:
     """Events of a reconstruction, and its phases."""
     events: list[Event] = []
@@ -141,7 +113,7 @@ def _told(
 
 
 def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_it_can(tmp_path: Path) -> None:
-    events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), Ticking(0.0))
+    events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), SteppedClock(tick=0.1))
     said = [str(event.data.get("message", "")) for event in events]
     fit = next(n for n, event in enumerate(events) if event.data.get("stage") == "recon")
     assert any("2 s do not suffice" in text for text in said[:fit])

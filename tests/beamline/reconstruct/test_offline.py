@@ -36,6 +36,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
+from tests.clock import SteppedClock
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -59,22 +60,11 @@ def _names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-class Ticking:
-    """A clock that each look at it moves on by a tenth of a second."""
-
-    def __init__(self) -> None:
-        self.time = 0.0
-
-    def now(self) -> float:
-        self.time += 0.1
-        return self.time
-
-
 def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tmp_path: Path) -> None:
     events: list[Event] = []
     options = _options(tmp_path, method=build(by_name("sirt"), {"iterations": 2}))
     options = replace(options, target=replace(options.target, report=tmp_path / "out.html"))
-    reconstruct_file(options, events.append, Ticking())
+    reconstruct_file(options, events.append, SteppedClock(tick=0.1))
     done = events[-1].data
     assert sum(done["times"].values()) == pytest.approx(done["elapsed"], abs=0.35)  # three looks beside the phases
     assert list(done["times"]) == [

@@ -9,7 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from beamline.reconstruct.snapshots import LivePicture
+from beamline.reconstruct.snapshots import live_picture, volume_rows
 from recon.base.volume import Grid, Volume
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
@@ -17,9 +17,10 @@ pytestmark = pytest.mark.usefixtures("real_pictures")
 GAP, TOP, LINES = 14, 30, 30  # pixels: between panels, of the title, of a label
 
 
-def shown(picture: LivePicture) -> np.ndarray:
+def shown(volume: Volume, view: np.ndarray, render: np.ndarray) -> np.ndarray:
     """[row, col, rgb] of the picture."""
-    return matplotlib.image.imread(io.BytesIO(picture.png()))[..., :3]
+    picture = live_picture(volume_rows(volume, view, render, "20 views", "mm"))
+    return matplotlib.image.imread(io.BytesIO(picture))[..., :3]
 
 
 def panel(image: np.ndarray, across: int, tall: int, above: int | None = None) -> np.ndarray:
@@ -36,7 +37,7 @@ def test_slices_are_where_the_matter_is_and_fill_their_panels(side: int, zoom: f
     volume = np.zeros(grid.shape, np.float32)
     volume[1:3, side // 2 : 3 * side // 4, side // 4 : side // 2] = 2.0
     view = rng.normal(0, 0.1, (20, side)).astype(np.float32)
-    image = shown(LivePicture(Volume(volume, grid), view, view, "20 views", "mm"))
+    image = shown(Volume(volume, grid), view, view)
     tall, low = round(side * zoom), round(20 * zoom)
     assert image.shape[1] == 3 * tall + 4 * GAP  # nothing between the panels but gaps
     assert image.shape[0] == TOP + 2 * (GAP + LINES) + tall + low + GAP
@@ -53,7 +54,7 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
     view = rng.normal(0, 0.1, (64, 64)).astype(np.float32)
     render = np.zeros((64, 64), np.float32)
     render[:32] = -0.5  # five times the noise less than the view
-    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)
+    difference = panel(shown(volume, view, render), 2, 256, 256)
     red, _, blue = (difference[..., k].mean(axis=1) for k in range(3))
     assert blue[10:100].mean() < 0.35 < 0.8 < red[10:100].mean()
     assert blue[150:250].mean() == pytest.approx(red[150:250].mean(), abs=0.05)  # noise alone
@@ -63,11 +64,10 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
 def test_the_time_that_it_takes_beside_a_fit(rng: np.random.Generator) -> None:
     grid = Grid((256, 256, 256), 0.01)
     volume, view = Volume(rng.random(grid.shape, np.float32), grid), rng.random((256, 256), np.float32)
-    picture = LivePicture(volume, view, 0.9 * view, "180 views so far", "mm")
     seconds = []
     for _ in range(5):
         before = time.process_time()
-        picture.png()
+        live_picture(volume_rows(volume, view, 0.9 * view, "180 views so far", "mm"))
         seconds.append(time.process_time() - before)
     print(f"{np.median(seconds):.2f} CPU s a picture of 256³ voxels")
     assert np.median(seconds) < 0.3

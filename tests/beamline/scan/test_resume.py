@@ -138,18 +138,6 @@ def test_only_the_missing_views_are_taken(tmp_path: Path, monkeypatch: pytest.Mo
         references = (first[layout.KIND][()] != FrameKind.PROJECTION).sum() + 7
     _assert_whole(run / "joined.h5", references)
     assert [finding.severity for finding in validate(run / "joined.h5", lambda done, of: None)] in ([], ["warning"])
-    for part in (run / "scan.h5", run / "part-2/scan.h5"):
-        line = f"This file is one of 2 parts of a scan: {run / 'joined.h5'} has the frames of all."
-        assert describe(part)["findings"].count(line) == 1
-        warned: list[str] = []
-        with open_scan(part) as source:
-            checked_views(source, Selection(steps=(ReferenceCheck("accept"),)), warned.append)
-        assert warned.count(line) == 1
-    said = describe(run / "joined.h5")
-    assert not any("parts of a scan" in finding for finding in said["findings"])
-    assert said["kinds"]["projection"] == VIEWS
-    assert said["attributes"]["status"] == "complete"
-    assert (said["missing_triggers"], said["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
     with h5py.File(run / "joined.h5") as file:  # as another program reads it
         assert len(file["exchange/data"]) == VIEWS
         np.testing.assert_array_equal(file["exchange/data"][-1], file["entry/data/data"][-3])
@@ -184,9 +172,26 @@ def test_a_view_that_became_invalid_is_taken(tmp_path: Path, monkeypatch: pytest
         assert sorted(f.trigger for f in source.frames() if f.kind is FrameKind.PROJECTION) == list(range(VIEWS))
 
 
+def _assert_told_of_parts(run: Path) -> None:
+    """Each part names the joined file, which speaks of no other."""
+    for part in (run / "scan.h5", run / "part-2/scan.h5"):
+        line = f"This file is one of 2 parts of a scan: {run / 'joined.h5'} has the frames of all."
+        assert describe(part)["findings"].count(line) == 1
+        warned: list[str] = []
+        with open_scan(part) as source:
+            checked_views(source, Selection(steps=(ReferenceCheck("accept"),)), warned.append)
+        assert warned.count(line) == 1
+    facts = describe(run / "joined.h5")
+    assert not any("parts of a scan" in finding for finding in facts["findings"])
+    assert facts["kinds"]["projection"] == VIEWS
+    assert facts["attributes"]["status"] == "complete"
+    assert (facts["missing_triggers"], facts["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
+
+
 def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
     _go_on(run)
+    _assert_told_of_parts(run)
     ingest(run / "joined.h5", tmp_path / "ingested.h5")
     images = np.zeros((2, 8, 12), np.uint16)
     for path in (run / "joined.h5", tmp_path / "ingested.h5"):
@@ -249,7 +254,7 @@ def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(
     run = _stopped(tmp_path, monkeypatch, at=FIRST + VIEWS, abort=True)
     stop = StopRequest()
     with open_for_resume(run) as series:
-        assert series.said.endswith("has all 12 views, its missing flats of the end are taken now")
+        assert series.in_words.endswith("has all 12 views, its missing flats of the end are taken now")
         with pytest.raises(BeamlineError, match="Interrupted before anything was acquired"):
             run_scan(
                 series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,27 +11,15 @@ import pytest
 from beamline.monitor.digest import digest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame, FrameKind
+from tests.clock import SteppedClock
 
 SHAPE = (12, 16)
 EPOCH = 1.8e9  # s; a day in January 2027
 
 
-@dataclass
-class StandingClock:
-    """A clock that the test sets."""
-
-    time: float = EPOCH
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds
-
-
 @pytest.fixture
-def clock() -> StandingClock:
-    return StandingClock()
+def clock() -> SteppedClock:
+    return SteppedClock(EPOCH)
 
 
 INFO = ScanInfo(
@@ -77,7 +64,7 @@ def frames(rng: np.random.Generator) -> list[Frame]:
 
 
 @pytest.fixture
-def write(tmp_path: Path, clock: StandingClock) -> Callable[[list[Frame]], Path]:
+def write(tmp_path: Path, clock: SteppedClock) -> Callable[[list[Frame]], Path]:
     """Write frames to a new, complete scan and give its path."""
 
     def write(frames: list[Frame], name: str = "scan.h5") -> Path:

@@ -26,7 +26,8 @@ from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.ending import DIED, ScanEnding
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+from tests.beamline.storage.conftest import INFO, SHAPE
+from tests.clock import SteppedClock
 
 VIEWS = 9
 REFERENCES = {"darks": {"count": 2, "at": "start"}, "flats": {"count": 3, "at": "start"}}
@@ -56,7 +57,7 @@ REFUSED = {("archive", "killed"), ("join", "killed")}
 
 
 @pytest.fixture
-def scan(tmp_path: Path, frames: list[Frame], clock: StandingClock) -> Iterator[Callable[[str], Path]]:
+def scan(tmp_path: Path, frames: list[Frame], clock: SteppedClock) -> Iterator[Callable[[str], Path]]:
     """A scan that ended so, and lacks a view unless it is complete."""
     with ExitStack() as running:
 

@@ -29,7 +29,8 @@ from recon.base.volume import Grid, VolumeSeries
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
-from tests.beamline.storage.conftest import StandingClock
+from tests.beamline.storage.conftest import EPOCH
+from tests.clock import SteppedClock
 
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = "\n".join((DOCS / f"{name}_layout.md").read_text(encoding="utf-8") for name in ("file", "scan", "volume"))
@@ -93,7 +94,7 @@ def whole_scan(tmp_path: Path) -> list[Path]:
     )  # fmt: skip
     frames = frames_of(SCAN)
     frames.append(replace(frames[-1], index=len(frames), kind=FrameKind.ALIGNMENT))
-    writer = NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=StandingClock())
+    writer = NXtomoWriter(tmp_path / "scan.h5", info, SCAN.shape, clock=SteppedClock(EPOCH))
     for frame in frames:
         writer.append(frame, digest(frame.counts))
     writer.close(beam=[BeamReading(1.0, "A", 1.8e9)])
@@ -129,7 +130,7 @@ def test_the_flags() -> None:
 
 def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
-    with NXtomoWriter(path, ScanInfo("s", pixel_size_mm=0.5), SCAN.shape, clock=StandingClock()) as writer:
+    with NXtomoWriter(path, ScanInfo("s", pixel_size_mm=0.5), SCAN.shape, clock=SteppedClock(EPOCH)) as writer:
         for frame in frames_of(SCAN):
             writer.append(frame, digest(frame.counts))
         writer.close("stopped", reason="Enough.")

@@ -22,7 +22,8 @@ from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import StandingClock
+from tests.beamline.storage.conftest import EPOCH
+from tests.clock import SteppedClock
 
 NAMES = [check.name for check in CHECKS]
 REGION = {"mass": (1, 3, 0, 6)}
@@ -32,7 +33,7 @@ REGION = {"mass": (1, 3, 0, 6)}
 def path(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A scan of 4 views: beam flagged in views 1 and 2 (an alarm), mass in view 2."""
     found = [[], [("beam", Level.WARN)], [("beam", Level.ALARM), ("mass", Level.WARN)], [("dark", Level.INFO)]]
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
         frame = Frame(rng.integers(0, 99, (4, 6)).astype(np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
         for row, pairs in enumerate(found):
             flags = [Flag(name, level, row, 1.5 * row, 0.0, "", REGION.get(name)) for name, level in pairs]
@@ -104,7 +105,7 @@ def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_me
     flags = FrameFlags.of_flags(found)
     assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4, 5, 6] and flags.alarmed.nonzero()[0].tolist() == [5, 6]
     assert flags.counts() == {"floater": {"warn": 5}, "ghost": {"alarm": 2}}
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
         frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
         for row, each in enumerate(found):
             writer.append(replace(frame, index=row), digest(frame.counts), each)
@@ -117,7 +118,7 @@ def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_me
 
 def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
     """Nothing can be created while a scan is written, and a follower may read the legend at any time."""
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
         assert writer.rows == 0
         code = "import sys, h5py; f = h5py.File(sys.argv[1], swmr=True, locking=False); print(*f[sys.argv[2]].asstr())"
         words = [sys.executable, "-c", code, str(writer.path), f"{LEGEND}/name"]
@@ -149,7 +150,7 @@ def test_a_finding_of_earlier_views_has_its_place_in_each_of_them_in_the_file_as
     flags = FrameFlags.of_flags(found)
     assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4]
     assert flags.scores is not None and flags.regions is not None
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=StandingClock()) as writer:
+    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
         frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
         for row, each in enumerate(found):
             writer.append(replace(frame, index=row), digest(frame.counts), each)

@@ -18,10 +18,11 @@ from beamline.storage.readers.open import NotReadyError, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock, scan_frames
+from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+from tests.clock import SteppedClock
 
 
-def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=3)
     with open_scan(tmp_path / "s.h5", follow=True) as source:
         seen = []
@@ -55,7 +56,7 @@ def follow_to_the_end(path: Path, opened: Event, result: multiprocessing.SimpleQ
 
 
 def test_a_follower_in_another_process_gets_every_frame(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     spawn = multiprocessing.get_context("spawn")
     opened, result = spawn.Event(), spawn.SimpleQueue()
@@ -111,7 +112,7 @@ def hold_open(path: Path, opened: Event, released: Event) -> None:
         released.wait()
 
 
-def test_another_programs_lock_costs_nothing(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+def test_another_programs_lock_costs_nothing(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     spawn = multiprocessing.get_context("spawn")
     opened, released = spawn.Event(), spawn.Event()
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
@@ -132,7 +133,7 @@ def test_another_programs_lock_costs_nothing(tmp_path: Path, clock: StandingCloc
 @pytest.mark.parametrize("closed", [True, False])
 @pytest.mark.parametrize("missing", [1, 1000])
 def test_a_file_that_is_cut_off_is_refused_at_once(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], missing: int, closed: bool
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], missing: int, closed: bool
 ) -> None:
     """Under SWMR, which opens a file whose writer died, HDF5 would wait for the missing bytes for hours."""
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:

@@ -57,7 +57,9 @@ def test_recover_and_archive_say_it(write: Write, frames: list[Frame]) -> None:
     before, small = path.read_bytes(), path.with_name("small.h5")
     done = recover(path)
     assert (done.changed, done.altered) == (False, (ROW,))
-    assert f"cannot be mended, with {len(frames)} frames; what it says of frames {ROW} is not as it was" in done.said()
+    assert (
+        f"cannot be mended, with {len(frames)} frames; what it says of frames {ROW} is not as it was" in done.in_words()
+    )
     with pytest.raises(DataError, match=rf"written with it: {ROW}\..*--keep-damaged. Nothing was written"):
         archive(path, small)
     assert path.read_bytes() == before and not small.exists()

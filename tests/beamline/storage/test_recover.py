@@ -28,7 +28,8 @@ from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock, scan_frames
+from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+from tests.clock import SteppedClock
 
 
 def _aged(path: Path) -> Path:
@@ -38,14 +39,14 @@ def _aged(path: Path) -> Path:
     return path
 
 
-def _written(path: Path, frames: list[Frame], clock: StandingClock) -> NXtomoWriter:
+def _written(path: Path, frames: list[Frame], clock: SteppedClock) -> NXtomoWriter:
     writer = NXtomoWriter(path, INFO, SHAPE, clock=clock, flush_every=5)
     for frame in frames:
         writer.append(frame, digest(frame.counts))
     return writer
 
 
-def _died_in_the_scan(folder: Path, frames: list[Frame], clock: StandingClock) -> Path:
+def _died_in_the_scan(folder: Path, frames: list[Frame], clock: SteppedClock) -> Path:
     """Two frames after the last flush."""
     writer = _written(folder / "s.h5", frames[:12], clock)
     shutil.copy(folder / "s.h5", folder / "died.h5")
@@ -53,7 +54,7 @@ def _died_in_the_scan(folder: Path, frames: list[Frame], clock: StandingClock) -
     return _aged(folder / "died.h5")
 
 
-def _died_at_the_end(folder: Path, frames: list[Frame], clock: StandingClock) -> Path:
+def _died_at_the_end(folder: Path, frames: list[Frame], clock: SteppedClock) -> Path:
     """Before the view of a complete scan was added, where another program then left its mark."""
     writer = _written(folder / "s.h5", frames[:10], clock)
     writer._put_exchange_view = lambda: None  # type: ignore[method-assign]
@@ -70,9 +71,9 @@ def _died_at_the_end(folder: Path, frames: list[Frame], clock: StandingClock) ->
 )
 def test_every_committed_frame_is_kept(
     tmp_path: Path,
-    clock: StandingClock,
+    clock: SteppedClock,
     frames: list[Frame],
-    died: Callable[[Path, list[Frame], StandingClock], Path],
+    died: Callable[[Path, list[Frame], SteppedClock], Path],
     status: str,
 ) -> None:
     path = died(tmp_path, frames, clock)
@@ -92,7 +93,7 @@ def test_every_committed_frame_is_kept(
     assert not recover(path).changed and path.read_bytes() == again
 
 
-def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     writer = _written(tmp_path / "s.h5", frames[:5], clock)
     before = (tmp_path / "s.h5").read_bytes()
     _aged(tmp_path / "s.h5")  # its writer waits: for a motor, the operator, or a long exposure
@@ -104,7 +105,7 @@ def test_what_may_still_be_written_is_left_alone(tmp_path: Path, clock: Standing
 
 
 def test_a_file_that_just_changed_is_left_alone_where_no_lock_tells(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     died = _died_in_the_scan(tmp_path, frames, clock)
     os.utime(died)
@@ -113,7 +114,7 @@ def test_a_file_that_just_changed_is_left_alone_where_no_lock_tells(
 
 
 def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     _written(tmp_path / "s.h5", frames[:10], clock).close()
     with h5py.File(tmp_path / "s.h5", "r+", libver=layout.LIBVER) as file:
@@ -122,12 +123,12 @@ def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
         shutil.copy(tmp_path / "s.h5", tmp_path / "died.h5")
     done = recover(_aged(tmp_path / "died.h5"))
     assert (done.changed, done.altered) == (True, (4,))
-    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.said()
+    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.in_words()
 
 
 @pytest.mark.parametrize("ahead", [1e3, 1e6])
 def test_a_file_of_a_clock_that_is_ahead_is_recovered(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], ahead: float
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], ahead: float
 ) -> None:
     died = _died_in_the_scan(tmp_path, frames, clock)
     os.utime(died, (died.stat().st_atime, time.time() + ahead))
@@ -135,7 +136,7 @@ def test_a_file_of_a_clock_that_is_ahead_is_recovered(
 
 
 def test_a_file_that_just_changed_by_the_clock_of_its_disk_is_left_alone(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     died = _died_in_the_scan(tmp_path, frames, clock)
     os.utime(died)
@@ -170,7 +171,7 @@ def test_the_writers_lock_is_given_back_when_it_is_killed(tmp_path: Path) -> Non
     ],
 )
 def test_a_damaged_file_is_refused_and_stays_as_it_is(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], damage: Callable[[bytes], bytes], said: str
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], damage: Callable[[bytes], bytes], said: str
 ) -> None:
     path = _died_in_the_scan(tmp_path, frames, clock)
     path.write_bytes(damage(path.read_bytes()))
@@ -189,7 +190,7 @@ def _torn(old: bytes, new: bytes) -> Iterator[bytes]:
 
 
 def test_a_block_that_a_kill_left_half_written_is_made_whole(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, died, seen = tmp_path / "s.h5", tmp_path / "died.h5", 0
     writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
@@ -238,7 +239,7 @@ def test_the_head_is_read_and_written_as_hdf5_does(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_was_on_the_disk(
-    tmp_path: Path, clock: StandingClock, rng: np.random.Generator
+    tmp_path: Path, clock: SteppedClock, rng: np.random.Generator
 ) -> None:
     """Any of the pages since the last fsync, which was after 15 frames: HDF5 overwrites its own blocks in place."""
     frames, on_disk, page = scan_frames(rng, 2, 3, 35), 15, 4096
@@ -269,7 +270,7 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             np.testing.assert_allclose(source.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
         assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
         if (kept := folder / "s.h5.damaged").exists():
-            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.said()
+            assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.in_words()
             anew += 1
         assert not recover(folder / "s.h5").changed
     assert anew  # ways that HDF5 cannot end such a file by

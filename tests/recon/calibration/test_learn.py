@@ -72,12 +72,14 @@ def test_a_change_is_of_its_terms_and_scales_with_pixels() -> None:
 
 def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
     change = GeometryChange(1.0, 0.0, 0.0, np.zeros((2, 2)))
-    assert LearntGeometry(change, ("axis",), ("roll",), 0.4, 0.3).said(2) == (
+    assert LearntGeometry(change, ("axis",), ("roll",), 0.4, 0.3).in_words(2) == (
         "Geometry learnt: the axis moves by +2.00 px. Views held out deviate by 0.3 in place of 0.4. Roll: left as it "
         "was, views held out do not confirm a change."
     )
     assert (
-        LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
+        LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4)
+        .in_words()
+        .startswith("Geometry: the views show no error")
     )
 
 

@@ -122,9 +122,9 @@ def test_what_a_field_cannot_do_is_refused() -> None:
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(), control=RunControl(resume={}))
     with pytest.raises(ValueError, match="device 'nowhere' cannot be used"):
         recon.reconstruct(data, VIEWS["parallel"], recon.NAF(), device="nowhere")
-    with pytest.raises(ValueError, match="levels must be 1 to 16, got 0"):
+    with pytest.raises(ValueError, match="levels must be a whole number from 1 to 16, got 0"):
         recon.NAF(levels=0)
-    with pytest.raises(ValueError, match="steps must be 1 or more"):
+    with pytest.raises(ValueError, match="steps must be a whole number of 1 or more"):
         recon.IntraTomo(steps=0)
 
 

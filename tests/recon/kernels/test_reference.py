@@ -72,7 +72,7 @@ def test_the_reference_is_the_integral_along_the_ray(
 ) -> None:
     parameters = some(rng)
     every = torch.ones(12, dtype=torch.bool)
-    image = reference.project_view(*parameters, geometry, view, exact=every, kernel=kernel).numpy()
+    image = reference.project_view(parameters, geometry, view, exact=every, kernel=kernel).numpy()
     expected = along_the_rays(parameters, geometry, view, kernel)
     # The sum along the ray is exact to 1e-6 for a smooth density; a compact kernel has a kink where it ends.
     np.testing.assert_allclose(image, expected, rtol=1e-6, atol=1e-4 if kernel.is_compact else 1e-9)
@@ -98,7 +98,7 @@ def test_the_affine_cone_is_off_as_published_and_as_estimated(
         for i in range(25):
             one = tuple(p[i : i + 1] for p in parameters)
             affine, exact = (
-                reference.project_view(*one, PUBLISHED, 0, exact=torch.tensor([e]), kernel=kernel).numpy()
+                reference.project_view(one, PUBLISHED, 0, exact=torch.tensor([e]), kernel=kernel).numpy()
                 for e in (False, True)
             )
             measured[i] = np.linalg.norm(affine - exact) / np.linalg.norm(exact)
@@ -115,7 +115,7 @@ def test_gradients_equal_finite_differences(
 ) -> None:
     tensors = [p.requires_grad_() for p in some(rng, 3, 4.0)]
     assert torch.autograd.gradcheck(
-        lambda *t: reference.project_view(*t, geometry.select([0]), 0, length=length, kernel=kernel), tensors
+        lambda *t: reference.project_view(t, geometry.select([0]), 0, length=length, kernel=kernel), tensors
     )
 
 
@@ -123,7 +123,7 @@ def test_gradients_equal_finite_differences(
 def test_gradients_of_exact_rays_equal_finite_differences(kernel: Kernel, rng: np.random.Generator) -> None:
     tensors = [p.requires_grad_() for p in some(rng, 3, 4.0)]
     mixed = torch.tensor([True, False, True])
-    assert torch.autograd.gradcheck(lambda *t: reference.project_view(*t, CONE, 1, exact=mixed, kernel=kernel), tensors)
+    assert torch.autograd.gradcheck(lambda *t: reference.project_view(t, CONE, 1, exact=mixed, kernel=kernel), tensors)
 
 
 @pytest.mark.parametrize("kernel", Kernel)
@@ -137,12 +137,12 @@ def test_gradients_of_voxels_equal_finite_differences(kernel: Kernel, rng: np.ra
 @pytest.mark.parametrize("exact", [False, True], ids=["affine", "exact"])
 def test_a_far_source_makes_a_parallel_beam(exact: bool, rng: np.random.Generator) -> None:
     parameters = some(rng)
-    parallel = reference.project_view(*parameters, PARALLEL, 1)
+    parallel = reference.project_view(parameters, PARALLEL, 1)
     every = torch.full((12,), exact)
     off = []
     for sod in (1e4, 1e5):
         far = Geometry.cone(ANGLES, SHAPE, 1.1 * 1.5, sod, 1.5 * sod, **SET_UP)
-        image = reference.project_view(*parameters, far, 1, exact=every)
+        image = reference.project_view(parameters, far, 1, exact=every)
         off.append(float((image - parallel).abs().max() / parallel.max()))
     assert off[1] < 1e-4
     assert off[1] == pytest.approx(off[0] / 10, rel=0.05)  # it falls as 1 / sod
@@ -166,8 +166,8 @@ def test_turning_the_object_is_turning_the_view(angle: float, turn: float, seed:
         Geometry.parallel([angle, angle - turn], SHAPE, pixel_pitch=1.1, roll=0.2, tilt=0.4),
         Geometry.cone([angle, angle - turn], SHAPE, 1.6, 25.0, 36.0, roll=0.2, tilt=0.4),
     ):
-        seen = reference.project_view(*moved, kind, 0, exact=every)
-        expected = reference.project_view(means, scales, quaternions, densities, kind, 1, exact=every)
+        seen = reference.project_view(moved, kind, 0, exact=every)
+        expected = reference.project_view((means, scales, quaternions, densities), kind, 1, exact=every)
         torch.testing.assert_close(seen, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -180,7 +180,7 @@ def test_the_uncorrected_factor_tells_densities_that_differ_from_side_to_side() 
     sides = Geometry.parallel([0.0, math.pi / 2], (31, 31), pixel_pitch=0.5)  # across it, along it
     peaks = {}
     for name, fixed in (("true", 0.0), ("plain", length)):
-        peaks[name] = [float(reference.project_view(*needle, sides, view, length=fixed)[15, 15]) for view in (0, 1)]
+        peaks[name] = [float(reference.project_view(needle, sides, view, length=fixed)[15, 15]) for view in (0, 1)]
     across, along = np.asarray(peaks["true"]) / np.asarray(peaks["plain"])
     assert along / across == pytest.approx(long / thin, rel=1e-5)
     assert peaks["plain"] == pytest.approx([length, length])
@@ -192,5 +192,5 @@ def test_what_lies_behind_the_source_is_not_seen() -> None:
     behind = (torch.tensor([[0.0, -10.5, 0.0], [0.0, -9.95, 0.0]]), torch.ones(2, 3), torch.ones(2, 4), torch.ones(2))
     doubles = tuple(p.double() for p in behind)
     for exact in (False, True):
-        image = reference.project_view(*doubles, cone, 0, exact=torch.full((2,), exact))
+        image = reference.project_view(doubles, cone, 0, exact=torch.full((2,), exact))
         assert not image.any()

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
 from recon.splatting.finish import Candidates, finish, judged
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
+from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
@@ -168,7 +169,7 @@ def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
-    with pytest.raises(ValueError, match="finish must be 0 sweeps or more, got -1"):
+    with pytest.raises(ValueError, match="finish must be a whole number of 0 or more, got -1"):
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
     with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2, r2-published has\)"):
         build(Fbp, {"finish": 2})
@@ -203,17 +204,29 @@ def test_another_slab_makes_no_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(one, other)
 
 
-def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(rng: np.random.Generator) -> None:
-    """A chequered box, sharp to the voxel; and a smooth blob between coarse voxels of a cone is left to them."""
+def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A chequered box, sharp to the voxel; the fit of a trial is ten times as dense, which no sweeps mend."""
     data = Projector(VIEWS, GRID).forward(_box()) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
-    fit = Mock(side_effect=lambda part, *_: R2(steps=5, gaussians=50, finish=0).run(part, RunControl()))
+
+    def poor(part: ReconProblem, *_: object) -> MethodResult:
+        fitted = R2(steps=5, gaussians=50, finish=0).run(part, RunControl())
+        fitted.volume.data[...] *= 10
+        return fitted
+
+    fit = Mock(side_effect=poor)
     tried = judged(_problem(data), R2().fit, RunControl(), fit)
     assert tried.by_voxels is not None and tried.fit is not None and tried.fit.mean() > tried.by_voxels.mean()
     assert set(tried.prior) == {"units", "weight", "strength"}
     assert fit.call_args[0][0].geometry.n_views == 26  # views held out are not fitted
+    fit.reset_mock()
+    monkeypatch.setattr("recon.splatting.finish.FAR_BEHIND", 0.0)
+    judged(_problem(data), R2().fit, RunControl(), fit)
     assert fit.call_count == 1 and fit.call_args[0][2] == 0.25  # too far behind for all steps
+    fit.reset_mock()
     none = judged(replace(_problem(data[:12]), geometry=VIEWS.select(range(12))), R2().fit, RunControl(), fit)
-    assert none.by_voxels is None and none.fit is None and fit.call_count == 1
+    assert none.by_voxels is None and none.fit is None and fit.call_count == 0
 
 
 def test_a_stop_ends_the_trials() -> None:
@@ -221,3 +234,16 @@ def test_a_stop_ends_the_trials() -> None:
     stop = RunControl(lambda: next(looks, True))
     tried = judged(_problem(data), R2().fit, stop, Mock())
     assert tried.by_voxels is None and not tried.prior
+
+
+@pytest.mark.parametrize(("voxels", "sweeps", "seconds"), [(24, 8, None), (12, 4, 1e9)])
+def test_a_longer_fit_changes_less(voxels: int, sweeps: int, seconds: float | None) -> None:
+    """Four times the steps: half the rates, and half the finish where voxels are coarse; so by a clock, too."""
+    cone = Geometry.cone(np.linspace(0, 2 * math.pi, 20, endpoint=False), (24, 24), 1.0, 60.0, 72.0)
+    grid = Grid((voxels,) * 3, 24 * cone.sample_pitch / voxels)
+    data = Projector(cone, grid).forward(np.pad(np.full((6, 6, 6), 0.1, np.float32), (voxels - 6) // 2))
+    settings = FitSettings(paced_for=2, tv_size=8)
+    method = R2(steps=8, seconds=seconds, gaussians=30, fit=settings)
+    made = reconstruct(data, cone, method, grid=grid).settings
+    assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 4)
+    assert made["finish"] == sweeps

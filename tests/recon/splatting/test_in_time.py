@@ -12,19 +12,9 @@ from recon import R2, Geometry, Grid, RunControl
 from recon.base.decisions import Decisions
 from recon.splatting.in_time import FinishPlan, finish_within
 from recon.voxels.projector import Projector
+from tests.clock import SteppedClock
 
 VIEWS = Geometry.cone(np.deg2rad(np.arange(61) * 360 / 61), (24, 40), 0.2, 100.0, 150.0)
-
-
-class Ticking:
-    """A clock that a look at it moves on by a tick."""
-
-    def __init__(self, tick: float) -> None:
-        self._tick, self._now = tick, 0.0
-
-    def __call__(self) -> float:
-        self._now += self._tick
-        return self._now
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +30,16 @@ def data() -> np.ndarray:
 def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     grid = Grid.matching(views)
-    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6,
+    # 24 views in three subsets, a look a tick: 3 ticks of views, 3 steps of total variation; before the first sweep 5,
     # and four trials of 16 over seven of eight views where time is left for these.
-    found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 39.0, 40.0, 69.0, 349.0, 350.0, 1e3)]
-    none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
-    assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
+    found = [
+        finish_within(s, 0.0, views, grid, SteppedClock(tick=1.0)) for s in (0.0, 41.0, 42.0, 77.0, 413.0, 414.0, 1e3)
+    ]
+    none, trials = [(0, 0.0, True)] * 2, [(8, 414.0, True)] * 2
+    assert found == [*none, (2, 42.0, False), (7, 72.0, False), (8, 78.0, False), *trials]
     # With patches, where time is left for their 35 steps, for the trials of total variation and for those of patches.
-    found = [finish_within(2e3, spare, views, grid, Ticking(1.0)) for spare in (857.0, 858.0)]
-    assert found == [(8, 350.0, True), (None, 857.5, True)]
+    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (1022.0, 1023.0)]
+    assert found == [(8, 414.0, True), (None, 1023.0, True)]
 
 
 @pytest.mark.slow
@@ -86,7 +78,7 @@ def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
     decided = Decisions().made
     for found in (3, 0):
         monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
-        control = RunControl(now=Ticking(1e-3), decide=(decide := Decisions(followed=decided)))
+        control = RunControl(now=SteppedClock(tick=1e-3), decide=(decide := Decisions(followed=decided)))
         done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
         assert done.settings["finish"] == 3
         decided = decide.made
@@ -97,7 +89,7 @@ def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
 ) -> None:
     for trials in (True, False):
         monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, t=trials: FinishPlan(2, 0.2, t))
-        control = RunControl(now=Ticking(1e-3), decide=Decisions(), stop_trials=lambda: True)
+        control = RunControl(now=SteppedClock(tick=1e-3), decide=Decisions(), stop_trials=lambda: True)
         done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
         assert done.settings["finish"] == 2 and control.decide is not None
         assert len(control.decide.made["weight"][0]) == (1 if trials else 2)  # the weight, and the noise to follow

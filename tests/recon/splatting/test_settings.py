@@ -13,7 +13,7 @@ from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.problem import join_pixels
-from recon.splatting.settings import FitSettings, tv_size, tv_weight
+from recon.splatting.settings import FitSettings, in_steps, share_of_prior, tv_size, tv_weight
 
 
 def test_settings_out_of_range_are_refused() -> None:
@@ -33,6 +33,13 @@ def test_settings_out_of_range_are_refused() -> None:
 def test_a_kernel_goes_by_its_name() -> None:
     for kernel in Kernel:
         assert FitSettings(kernel=kernel.value).kernel is kernel  # type: ignore[arg-type]
+
+
+def test_a_longer_fit_is_slower_and_asks_less_of_its_prior() -> None:
+    usual = FitSettings()
+    assert in_steps(usual, 50) == in_steps(usual, 400) == usual and share_of_prior(usual, 400) == 1
+    longer = in_steps(usual, 1600)
+    assert (longer.pace, longer.tv_least, share_of_prior(usual, 1600)) == (13.0, 0.005, 0.5)
 
 
 _WITHOUT_LIMITS = {noise: 3e5 * noise**2 / 24 for noise in (1e-4, 2e-3, 4e-3, 0.1)}

@@ -24,22 +24,12 @@ from recon.splatting.stream import StreamingFit
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.clock import SteppedClock
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
 VIEWS = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH)
 GRID = Grid.matching(VIEWS)
-
-
-class StepClock:
-    """Time that passes only when it is looked at: a test takes the same number of steps on any machine."""
-
-    def __init__(self, tick: float = 0.01) -> None:
-        self.time, self.tick = 0.0, tick
-
-    def __call__(self) -> float:
-        self.time += self.tick
-        return self.time
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +51,7 @@ def data(phantom: Phantom) -> np.ndarray:
 
 
 def _stream(data: np.ndarray, order: np.ndarray, seed: int = 0) -> StreamingFit:
-    model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=SteppedClock(tick=0.01))
     for view in order:
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
         model.advance(0.1)
@@ -82,7 +72,7 @@ def streamed(data: np.ndarray, phantom: Phantom) -> tuple[np.ndarray, float]:
 
 def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom: Phantom) -> None:
     truth = phantom.attenuation(GRID)
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
     quality = []
     for view in range(40):
         model.add_views(data[view : view + 1], ANGLES[view : view + 1])
@@ -103,9 +93,9 @@ def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[n
 def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
     mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
     method = recon.R2(gaussians=1500, fit=FitSettings(**mine))  # type: ignore[arg-type]
-    model = method.stream(VIEWS, 0, StepClock())
+    model = method.stream(VIEWS, 0, SteppedClock(tick=0.01))
     assert model.settings == replace(WHILE_VIEWS_COME, **mine)
-    assert recon.R2().stream(VIEWS, 0, StepClock()).settings == WHILE_VIEWS_COME
+    assert recon.R2().stream(VIEWS, 0, SteppedClock(tick=0.01)).settings == WHILE_VIEWS_COME
     for first in range(0, 40, 8):
         model.add_views(data[first : first + 8], ANGLES[first : first + 8])
         model.advance(0.5)
@@ -114,11 +104,11 @@ def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phant
     assert found is not None and found.kernel is Kernel.GAUSSIAN
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 20
     with pytest.raises(ValueError, match="bin the scan, or leave it out"):
-        recon.R2(fit=FitSettings(joined_pixels=2)).stream(VIEWS, 0, StepClock())
+        recon.R2(fit=FitSettings(joined_pixels=2)).stream(VIEWS, 0, SteppedClock(tick=0.01))
 
 
 def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:
-    model = StreamingFit(VIEWS, GRID, first_views=4, first_span=np.pi / 4, gaussians=500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, first_views=4, first_span=np.pi / 4, gaussians=500, now=SteppedClock(tick=0.01))
     model.add_views(data[:6], ANGLES[:6])  # six views over 22 degrees
     assert not model.started and model.advance(0.1).n_gaussians == 0
     assert not model.snapshot().data.any()
@@ -137,7 +127,7 @@ def test_a_third_of_the_steps_learn_the_newest_views_and_the_end_decays_to_the_e
         return step(state, problem, settings, fraction, view)
 
     monkeypatch.setattr(fit, "step", spy)
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
     model.advance(6.0)
     newest = [view for view, _ in taken if view is not None]
@@ -160,7 +150,7 @@ def test_a_view_that_has_come_is_learnt_by_the_next_step(data: np.ndarray, monke
         taken.append(view)
         return step(state, problem, settings, fraction, view)
 
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=100, now=SteppedClock(tick=0.01))
     model.add_views(data[:20], ANGLES[:20])
     model.advance(0.1)
     monkeypatch.setattr(fit, "step", spy)
@@ -177,7 +167,7 @@ def test_a_view_that_has_come_is_learnt_by_the_next_step(data: np.ndarray, monke
 
 def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     def placed() -> tuple[Gaussians, int]:
-        model = StreamingFit(VIEWS, GRID, 0, gaussians=500, now=StepClock())
+        model = StreamingFit(VIEWS, GRID, 0, gaussians=500, now=SteppedClock(tick=0.01))
         model.add_views(data, ANGLES)
         model.advance(0.0)
         assert model.gaussians is not None
@@ -208,7 +198,7 @@ def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.Mo
             first(model, known if knows else None)
 
         monkeypatch.setattr(StreamingFit, "_place_first", place)
-        model = StreamingFit(geometry, Grid.matching(geometry), now=StepClock(0.5))
+        model = StreamingFit(geometry, Grid.matching(geometry), now=SteppedClock(tick=0.5))
         for view in range(22):
             model.add_views(data[view : view + 1], geometry.angles[view : view + 1])
             model.advance(25.0)
@@ -220,7 +210,7 @@ def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.Mo
 
 
 def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phantom: Phantom) -> None:
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
     model.advance(4.0)
     truth, settings = phantom.attenuation(GRID), model.settings
@@ -235,7 +225,7 @@ def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phan
 
 def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
     greedy = FitSettings(policy=DensityPolicy(start=0, every=1, threshold=0, prune_below=0))
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=500, settings=greedy, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=500, settings=greedy, now=SteppedClock(tick=0.01))
     counts = []
     for first, last in ((0, 16), (16, 24), (24, 36)):  # each half as many again
         model.add_views(data[first:last], ANGLES[first:last])
@@ -247,7 +237,7 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
 @pytest.mark.parametrize("offset", [-1e-5, 1e-5])
 def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
     # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
-    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
     for view, angle in enumerate(np.linspace(0, 1, 10)):
         noise = np.random.default_rng(view).normal(offset, 1e-5, (1, *SHAPE)).astype(np.float32)
         model.add_views(noise, [angle])
@@ -278,7 +268,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
 
 
 def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
-    model = StreamingFit(VIEWS, GRID, gaussians=500, now=StepClock())
+    model = StreamingFit(VIEWS, GRID, gaussians=500, now=SteppedClock(tick=0.01))
     for first, last in ((0, 5), (5, 21), (21, 22)):  # before and after there is a model
         model.add_views(data[first:last], ANGLES[first:last])
         model.replace_newest(data[last - 1] + 1)
@@ -320,7 +310,7 @@ def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np
     told = Geometry.parallel([0.0], SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])
     found = []
     for template in (VIEWS, told):
-        model = StreamingFit(template, GRID, gaussians=500, now=StepClock())
+        model = StreamingFit(template, GRID, gaussians=500, now=SteppedClock(tick=0.01))
         model.add_views(data[:20], ANGLES[:20])
         model.advance(0.1)
         model.add_views(data[20:], ANGLES[20:])
@@ -355,7 +345,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
     """Half a circle of views about an axis that is off by d shows the sample off by 4 d / π across its middle."""
     truth, off = phantom.attenuation(GRID), 0.8
     wrong = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + off)
-    model = StreamingFit(wrong, GRID, 0, gaussians=1500, now=StepClock())
+    model = StreamingFit(wrong, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
     model.add_views(data, ANGLES)
     model.advance(4.0)
     before, quality = model.gaussians, psnr(truth, model.snapshot().data)
@@ -370,7 +360,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
 def _disturbed(data: np.ndarray, truth: np.ndarray, batches: list[np.ndarray], axis_off: float = 0.0) -> float:
     """PSNR in dB of a stream of these batches of views, whose axis is corrected once half of the views are there."""
     template = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + axis_off)
-    model = StreamingFit(template, GRID, 0, gaussians=1500, now=StepClock())
+    model = StreamingFit(template, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
     for batch in batches:
         model.add_views(data[batch], ANGLES[batch])
         model.advance(0.1)

@@ -9,20 +9,10 @@ import pytest
 from simulators.effects.catalogue import CATALOGUE, Domain
 from simulators.scenes.explain import explain
 from simulators.scenes.scene import load_scene
+from tests.clock import SteppedClock
 from tests.simulators.shots import PHANTOM, shot
 
 EFFECTS = ["rolling_shutter", {"kind": "beam_profile", "sigma": [1.0, 1.0]}, "photon_noise", "read_noise", "offset"]
-
-
-class _Ticks:
-    """A clock that goes on by 1 ms whenever it is read: a step takes 1 ms, whatever it does."""
-
-    def __init__(self) -> None:
-        self._now = 0.0
-
-    def __call__(self) -> float:
-        self._now += 1e-3
-        return self._now
 
 
 def _scene(*effects: Any) -> Any:
@@ -30,7 +20,7 @@ def _scene(*effects: Any) -> Any:
 
 
 def test_steps_stand_in_the_order_in_which_they_run() -> None:
-    found = explain(_scene(*EFFECTS), shot(angle_at=lambda time: 0.4), _Ticks(), repeats=2)
+    found = explain(_scene(*EFFECTS), shot(angle_at=lambda time: 0.4), SteppedClock(tick=1e-3), repeats=2)
     named = [cost.name for cost in found.costs]
     assert named == [
         "line_integrals", "rolling_shutter", "beer_lambert", "beam_profile", "photon_noise", "read_noise", "offset",
@@ -43,7 +33,7 @@ def test_steps_stand_in_the_order_in_which_they_run() -> None:
 
 
 def test_costs_are_those_of_the_steps() -> None:
-    found = explain(_scene(*EFFECTS), shot(angle_at=lambda time: 0.4), _Ticks(), repeats=3)
+    found = explain(_scene(*EFFECTS), shot(angle_at=lambda time: 0.4), SteppedClock(tick=1e-3), repeats=3)
     # Each step is entered once, but for "digitise", which converts before the counts' effects and rounds after them.
     ms = {cost.name: cost.ms for cost in found.costs}
     assert ms == {
@@ -57,8 +47,8 @@ def test_costs_are_those_of_the_steps() -> None:
 
 
 def test_what_is_unused_is_said() -> None:
-    found = explain(_scene("offset"), shot(), _Ticks(), repeats=1)
+    found = explain(_scene("offset"), shot(), SteppedClock(tick=1e-3), repeats=1)
     assert {name for name, _ in found.unused} == set(CATALOGUE) - {"offset"}
     assert dict(found.unused)["photon_noise"] == CATALOGUE["photon_noise"].summary
-    bare = explain(_scene(), shot(), _Ticks(), repeats=1)
+    bare = explain(_scene(), shot(), SteppedClock(tick=1e-3), repeats=1)
     assert [cost.name for cost in bare.costs] == ["line_integrals", "beer_lambert", "digitise"]

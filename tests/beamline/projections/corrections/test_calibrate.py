@@ -64,9 +64,12 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
     done = found.done["calibrate"]
-    assert done.said.startswith("Geometry learnt: the axis moves by +") and "Views held out deviate by" in done.said
+    assert (
+        done.sentence.startswith("Geometry learnt: the axis moves by +")
+        and "Views held out deviate by" in done.sentence
+    )
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
-    assert plain.done["calibrate"].said == ""
+    assert plain.done["calibrate"].sentence == ""
 
 
 def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
@@ -110,5 +113,5 @@ def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Pa
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
     with pytest.raises(ConfigError, match=r"--calibrate learns what .* states: give one of"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
-    with pytest.raises(ValueError, match="'lean' is not known; choose from axis, roll, tilt, shifts"):
+    with pytest.raises(ValueError, match="term 'lean' is unknown; legal: axis, roll, tilt, shifts"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")

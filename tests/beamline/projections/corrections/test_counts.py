@@ -61,7 +61,7 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     assert weights is not None and logarithm.ray_weights() is None
     assert abs(np.average((counted.projections.data - EXACT)[behind], weights=weights[behind])) < 0.03
     assert np.mean((logarithm.projections.data - EXACT)[behind]) > 0.1
-    assert "10" in counted.done["noise"].said and logarithm.done["noise"].said == ""
+    assert "10" in counted.done["noise"].sentence and logarithm.done["noise"].sentence == ""
 
 
 @pytest.mark.parametrize(("photons", "noise", "counted"), [
@@ -118,7 +118,7 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:
-    assert prepare(scan(20, n_flats=1), PLAIN).done["noise"].said == ""
+    assert prepare(scan(20, n_flats=1), PLAIN).done["noise"].sentence == ""
     with pytest.raises(ConfigError, match="--gain COUNTS"):
         prepare(scan(20, n_flats=1), PLAIN.with_steps(CountModel("counts")))
 

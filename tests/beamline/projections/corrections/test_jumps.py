@@ -67,7 +67,7 @@ def test_views_after_a_jump_are_corrected_by_shifts(tmp_path: Path) -> None:
     np.testing.assert_allclose(shifts[later, 1], 1.0, atol=0.2)
     np.testing.assert_allclose(unseen.shifts[:, 1], shifts[-1, 1])
     assert told.startswith("The sample jumped at frame 45. 19 views are corrected by shifts: the sample lies +1.")
-    assert told == found.done["jumps"].said and found.view_weights is None  # what `opposite` saw is corrected
+    assert told == found.done["jumps"].sentence and found.view_weights is None  # what `opposite` saw is corrected
     rays = found.ray_weights(3)
     assert rays is not None and len(rays) == 55 + 3
     assert (rays[:JUMP] == 1).all() and (rays[JUMP:-3, 0] == 0).all() and (rays[JUMP:-3, 2:] == 1).all()

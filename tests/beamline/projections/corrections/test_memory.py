@@ -105,7 +105,7 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape:
         data, ones = views.astype(np.float32), np.ones(n, np.float32)
         found = Projections(data, np.arange(n), 0.0, ones, np.zeros((rows, cols), bool))
         prepared = PreparedProjections(found, part.geometry, (cols - 1) / 2, None, None, n, "px", "counts")
-        assert step.apply(prepared, angles, lambda n, of: None).said
+        assert step.apply(prepared, angles, lambda n, of: None).sentence
 
     assert 0.25 * step.memory(part).alone < peak(work) - 4 * views.size < step.memory(part).alone
 

@@ -104,7 +104,7 @@ def test_poses_are_those_of_the_file_in_any_order(tmp_path: Path, by: str) -> No
             replace(found, geometry=Geometry.parallel(np.radians(DEGREES), SHAPE, pixel_pitch=PITCH, axis_col=AXIS))
         )
     )
-    assert found.done["poses"].said.startswith("40 poses from")
+    assert found.done["poses"].sentence.startswith("40 poses from")
 
 
 def test_no_pixel_is_resampled(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
     """What was said of the tilt, and the degrees that the file records."""
     done = prepared.done["tilt"]
     assert done.parameters is not None
-    return done.said, done.parameters["tilt_deg"]
+    return done.sentence, done.parameters["tilt_deg"]
 
 
 def test_a_tilt_is_warned_of() -> None:

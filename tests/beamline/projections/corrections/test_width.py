@@ -47,7 +47,7 @@ def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
     unknown.exposures[:] = np.nan
     for source in (_source("step"), unknown):
         before, after, done = _rays(Width(), source)
-        assert after is before and (done.said, done.parameters) == ("", {})
+        assert after is before and (done.sentence, done.parameters) == ("", {})
     before, after, _ = _rays(Width(arc="none"), _source())
     assert after is before
 
@@ -58,7 +58,7 @@ def test_a_stage_that_hardly_moved_was_in_the_middle_of_the_exposure_too(sense: 
     before, after, done = _rays(Width(), _source(sense=sense, exposure=0.01))
     turned = sense * STEP / PERIOD * 0.01 / 2
     np.testing.assert_allclose(after.angles, before.angles + turned, rtol=0, atol=1e-15)
-    assert (after.width, after.skew) == (before.width, 0) and done.said == ""
+    assert (after.width, after.skew) == (before.width, 0) and done.sentence == ""
     assert done.parameters == {"middle_of_exposure_deg": pytest.approx(math.degrees(turned))}
 
 
@@ -68,7 +68,7 @@ def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
     assert after.width.arc == pytest.approx(ARC) and after.width.variance == 0
     assert after.skew == pytest.approx(sense * SKEW)
     np.testing.assert_allclose(after.angles, before.angles + sense * ARC / 2)
-    assert done.said == (
+    assert done.sentence == (
         "In the model of the views a view is the mean over 1.6 degrees (2.8 px at the edge of the field), the last row "
         f"sees {sense * 0.25:.2g} degrees more than the first."
     )
@@ -99,7 +99,7 @@ def test_a_pixel_has_its_area_and_blur() -> None:
     before, after, done = _rays(Width("0.6", "none"), _source(), Selection(binning=2))
     assert (after.width.pixel, after.width.blur, after.skew) == (1, 0.3, 0)
     np.testing.assert_array_equal(after.angles, before.angles)
-    assert done.said == "In the model of the views a pixel has its own area and a blur of 0.6 px."
+    assert done.sentence == "In the model of the views a pixel has its own area and a blur of 0.6 px."
 
 
 def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
@@ -151,7 +151,7 @@ def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: lis
         assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
     moved = math.radians(180) / 6 / scan.period * 0.012
     assert seen.width.arc == pytest.approx(moved if effects else 0)
-    assert (done.said != "") == bool(effects)
+    assert (done.sentence != "") == bool(effects)
 
 
 def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:

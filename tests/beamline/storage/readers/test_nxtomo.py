@@ -20,7 +20,8 @@ from beamline.storage.readers.open import NotReadyError, SourceOptions, open_sca
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import INFO, StandingClock
+from tests.beamline.storage.conftest import EPOCH, INFO
+from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
 
@@ -50,7 +51,7 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
     shape = frames[0].counts.shape if frames else (2, 3)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.h5"
-        with NXtomoWriter(path, INFO, shape, clock=StandingClock(), flush_every=flush_every) as writer:
+        with NXtomoWriter(path, INFO, shape, clock=SteppedClock(EPOCH), flush_every=flush_every) as writer:
             for frame in frames:
                 writer.append(frame, digest(frame.counts))
         with open_scan(path) as source:

@@ -24,7 +24,8 @@ from beamline.storage.rules.validate import change_of_rows, source_findings, val
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+from tests.beamline.storage.conftest import INFO, SHAPE
+from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
 DETECTOR = "entry/instrument/detector"
@@ -233,7 +234,7 @@ def test_a_camera_that_was_armed_again_is_no_fault(write: Write, frames: list[Fr
     assert ("error", "framestamps") in found(write(back, "back.h5"))  # type: ignore[call-arg]
 
 
-def test_degrees_that_are_radians(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+def test_degrees_that_are_radians(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
         for frame in frames[:5]:
             writer.append(frame, digest(frame.counts))
@@ -357,7 +358,7 @@ def test_what_cannot_be_opened_is_a_finding(tmp_path: Path) -> None:
     assert found(tmp_path / "empty.h5") == {("error", "readable")}
 
 
-def test_a_growing_file_can_be_validated(tmp_path: Path, clock: StandingClock, frames: list[Frame]) -> None:
+def test_a_growing_file_can_be_validated(tmp_path: Path, clock: SteppedClock, frames: list[Frame]) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     for frame in frames:
         writer.append(frame, digest(frame.counts))

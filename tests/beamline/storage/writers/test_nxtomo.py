@@ -21,7 +21,8 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, StandingClock
+from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE
+from tests.clock import SteppedClock
 
 Write = Callable[[list[Frame]], Path]
 
@@ -75,7 +76,7 @@ def test_times_are_iso_8601(write: Write, frames: list[Frame]) -> None:
             assert said == datetime.fromtimestamp(EPOCH, UTC)
 
 
-def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: StandingClock) -> None:
+def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: SteppedClock) -> None:
     """Variable-length text written under SWMR is not (h5py issue 1273); ours is all made before, or of fixed length."""
     writer = NXtomoWriter(tmp_path / "s.h5", replace(INFO, sample="Prüfkörper µ"), SHAPE, clock=clock)
     look = (
@@ -96,7 +97,7 @@ def test_text_is_readable_while_the_file_grows(tmp_path: Path, clock: StandingCl
     writer.close()
 
 
-def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, clock: StandingClock) -> None:
+def test_a_file_that_cannot_be_laid_out_is_not_left_half_made(tmp_path: Path, clock: SteppedClock) -> None:
     info = replace(INFO, devices={"stage": {"model": object()}})  # type: ignore[dict-item]
     with pytest.raises(TypeError):
         NXtomoWriter(tmp_path / "s.h5", info, SHAPE, clock=clock)
@@ -135,7 +136,7 @@ def test_exchange_view_shows_the_same_frames_and_moves_with_the_file(
 
 
 def test_a_stopped_scan_has_a_view_of_the_rows_that_exist(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     for frame in frames[:7]:
@@ -153,7 +154,7 @@ def test_a_stopped_scan_has_a_view_of_the_rows_that_exist(
         assert (source.attributes["status"], source.attributes["missing_triggers"]) == ("stopped", 2)
 
 
-def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: StandingClock) -> None:
+def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: SteppedClock) -> None:
     NXtomoWriter(tmp_path / "s.h5", ScanInfo("nothing"), SHAPE, clock=clock).close("failed")
     with open_scan(tmp_path / "s.h5") as source:
         assert source.refresh() == 0
@@ -189,7 +190,7 @@ def test_an_alignment_frame_is_no_view_to_those_who_do_not_know_it(write: Write,
     [(180.0, None, b"Full"), (360.0, 7.5, b"Full"), (360.0, 11.0, b"Half"), (360.0, None, None)],
 )
 def test_what_the_programs_of_esrf_know_an_nxtomo_by(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], turn: float, axis: float | None, field: bytes | None,
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], turn: float, axis: float | None, field: bytes | None,
     planned: bool,
 ) -> None:  # fmt: skip
     """While the file grows, too. A plan without angles and an axis that is not known leave the field of view out."""
@@ -213,7 +214,7 @@ def test_what_the_programs_of_esrf_know_an_nxtomo_by(
 
 
 def test_an_exception_inside_leaves_a_failed_but_readable_file(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     with (
         pytest.raises(RuntimeError, match="camera"),
@@ -226,7 +227,7 @@ def test_an_exception_inside_leaves_a_failed_but_readable_file(
         np.testing.assert_array_equal(source.read([0])[0], frames[0].counts)
 
 
-def test_never_overwrites(tmp_path: Path, clock: StandingClock) -> None:
+def test_never_overwrites(tmp_path: Path, clock: SteppedClock) -> None:
     path = tmp_path / "s.h5"
     path.write_bytes(b"precious")
     with pytest.raises(DataError, match="never overwrites"):
@@ -237,7 +238,7 @@ def test_never_overwrites(tmp_path: Path, clock: StandingClock) -> None:
 
 
 def test_wrong_frames_are_refused_and_nothing_is_written(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))

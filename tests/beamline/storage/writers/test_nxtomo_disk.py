@@ -23,11 +23,12 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout, to_disk
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame
-from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
+from tests.beamline.storage.conftest import INFO, SHAPE
+from tests.clock import SteppedClock
 
 
 def test_a_full_disk_is_named_and_earlier_rows_stay(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
@@ -56,7 +57,7 @@ def no_room(call: str = "take") -> RuntimeError:
 
 
 def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_committed(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To close the file would be to write once more what the disk did not take, with a traceback for each id."""
     path = tmp_path / "s.h5"
@@ -89,7 +90,7 @@ def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_
 
 
 def test_a_disk_that_is_full_when_the_scan_ends_is_named(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
@@ -107,7 +108,7 @@ def test_a_disk_that_is_full_when_the_scan_ends_is_named(
 
 
 def test_no_view_is_begun_where_there_is_no_room_for_it(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
@@ -122,7 +123,7 @@ def test_no_view_is_begun_where_there_is_no_room_for_it(
 
 
 def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame]
 ) -> None:
     """The /exchange view comes to an ordinary file: but for the head and the group, it only makes it longer."""
     before, changed = [b""], tmp_path / "s.h5"
@@ -147,7 +148,7 @@ def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
 
 
 def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
-    tmp_path: Path, clock: StandingClock, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise no_room()
@@ -159,7 +160,7 @@ def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
 
 
 def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls, begun = [], threading.Event()
 
@@ -180,7 +181,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
 
 
 def test_a_disk_that_did_not_take_what_was_flushed_is_told(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[int] = []
 
@@ -202,7 +203,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
 
 
 def test_a_disk_that_hangs_does_not_hold_the_writer(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hangs = threading.Event()
     calls: list[int] = []
@@ -231,7 +232,7 @@ def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.Monke
 
 
 def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -262,7 +263,7 @@ def _cut_in_half(path: Path) -> None:
 @pytest.mark.parametrize("at", [5, 14])
 @pytest.mark.parametrize(("touch", "said"), [(_cut, "to 0 bytes"), (_cut_in_half, "was cut"), (Path.unlink, "deleted")])
 def test_a_file_that_another_program_touches_ends_the_scan(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
+    tmp_path: Path, clock: SteppedClock, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
 ) -> None:
     """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)

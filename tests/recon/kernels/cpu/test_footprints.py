@@ -79,7 +79,7 @@ def leaves(parameters: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
 def reference_image(doubles: tuple[Tensor, ...], geometry: Geometry, view: int, length: float) -> Tensor:
     means, log_scales, quaternions, densities = doubles
     density = UNIT * torch.nn.functional.softplus(densities)
-    return reference.project_view(means, log_scales.exp(), quaternions, density, geometry, view, length=length)
+    return reference.project_view((means, log_scales.exp(), quaternions, density), geometry, view, length=length)
 
 
 @pytest.mark.parametrize("length", [0.0, 2.5], ids=["rectified", "plain"])

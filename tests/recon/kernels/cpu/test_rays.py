@@ -41,14 +41,14 @@ def raw(rng: np.random.Generator, n: int = 25, extent: float = 10.0, largest: fl
 
 def rays_of(active: Active, geometry: Geometry, faint: float = 1e-12, cut: float = 8.0) -> CpuRays:
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    return CpuRays(*parameters, camera(geometry, 0), geometry.detector_shape, faint, cut)
+    return CpuRays(parameters, camera(geometry, 0), geometry.detector_shape, faint, cut)
 
 
 def exact_view(leaves: Sequence[torch.Tensor], geometry: Geometry) -> torch.Tensor:
     means, log_scales, quaternions, densities = leaves
     every = torch.ones(means.shape[0], dtype=torch.bool)
     density = UNIT * torch.nn.functional.softplus(densities)
-    return reference.project_view(means, log_scales.exp(), quaternions, density, geometry, 0, exact=every)
+    return reference.project_view((means, log_scales.exp(), quaternions, density), geometry, 0, exact=every)
 
 
 def as_leaves(parameters: tuple[F32, ...]) -> list[torch.Tensor]:

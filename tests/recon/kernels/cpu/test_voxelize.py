@@ -58,7 +58,7 @@ def test_density_and_gradients_equal_the_reference(
 ) -> None:
     model, quaternions = _model(rng, 12)
     origin = tuple(-e * (n - 1) / 2 for e, n in zip(spacing[::-1], shape[::-1], strict=True))
-    layout = Layout(*model, origin, spacing, shape, 0.0, 6.0)  # type: ignore[arg-type]
+    layout = Layout(model, origin, spacing, shape, 0.0, 6.0)  # type: ignore[arg-type]
     expected, leaves = _reference(model, quaternions, _axes(origin, spacing, shape))
     top = float(expected.detach().max())
     np.testing.assert_allclose(layout.fill(), expected.detach().numpy(), atol=1e-5 * max(1.0, top))
@@ -90,7 +90,7 @@ def test_the_backward_pass_is_the_adjoint_in_density(rng: np.random.Generator) -
     # Truncated or not: <fill(ρ), g> = ρ · ∂ρ, since both passes take the same voxels.
     model, _ = _model(rng, 40, 0.2, 4.0)
     shape = (9, 14, 20)
-    layout = Layout(*model, (-7.0, -5.0, -4.0), 1.0, shape, 1e-4, 3.5)
+    layout = Layout(model, (-7.0, -5.0, -4.0), 1.0, shape, 1e-4, 3.5)
     g = rng.normal(size=shape).astype(np.float32)
     into = [np.zeros(s, np.float32) for s in ((40, 3), (40, 3), (40, 9), (40,))]
     layout.backward(g, *into)
@@ -109,7 +109,7 @@ def test_needles_discs_and_dots_keep_their_digits(
     if max(scales) < 0.1:
         means = (np.round(means) + 0.02).astype(np.float32)  # else no voxel sees them
     model = (means, thin, rotations, densities)
-    layout = Layout(*model, (-6.0, -6.0, -6.0), 1.0, (13, 13, 13), 0.0, 5.0, kernel)
+    layout = Layout(model, (-6.0, -6.0, -6.0), 1.0, (13, 13, 13), 0.0, 5.0, kernel)
     expected = _reference(model, quaternions, _axes((-6.0,) * 3, (1.0,) * 3, (13, 13, 13)), kernel)[0].detach().numpy()
     assert expected.max() > 0.05
     # A float32 rotation turns a needle by 6e-8: at its end, ten voxels off, a few 1e-6 of the thin width's slope.
@@ -121,14 +121,14 @@ def test_only_gaussians_that_meet_the_box_are_placed(rng: np.random.Generator) -
     model, _ = _model(rng, 3000, 0.3, 0.6)
     model[0][:] = rng.uniform(-100, 100, (3000, 3))
     shape, origin = (10, 11, 12), (3.0, -20.0, 40.0)
-    layout = Layout(*model, origin, 2.0, shape, 1e-6, 3.5)
+    layout = Layout(model, origin, 2.0, shape, 1e-6, 3.5)
     low, high = np.array(origin), np.array(origin) + 2.0 * (np.array(shape[::-1]) - 1)
     reach = 3.5 * np.sqrt(((model[2].reshape(-1, 3, 3) * model[1][:, None, :]) ** 2).sum(2))
     expected = np.flatnonzero(((model[0] + reach >= low) & (model[0] - reach <= high)).all(1))
     # Those that lie between two slices are met by none.
     assert set(layout.hits) <= set(expected) and np.all(np.diff(layout.hits) > 0)
     assert len(layout.hits) > 0
-    brute = Layout(*(a[expected] for a in model), origin, 2.0, shape, 1e-6, 3.5)
+    brute = Layout(tuple(a[expected] for a in model), origin, 2.0, shape, 1e-6, 3.5)
     np.testing.assert_array_equal(layout.fill(), brute.fill())
 
 
@@ -137,7 +137,7 @@ def test_nothing_to_place_is_an_empty_volume() -> None:
     far = tuple(np.full(s, 1e6, np.float32) for s in ((2, 3), (2, 3), (2, 9), (2,)))
     faint = tuple(np.ones(s, np.float32) for s in ((2, 3), (2, 3), (2, 9), (2,)))
     for model, limit in ((nothing, 0.0), (far, 1e9), (faint, 2.0)):
-        layout = Layout(*model, (0.0, 0.0, 0.0), 1.0, (3, 4, 5), limit, 3.5)
+        layout = Layout(model, (0.0, 0.0, 0.0), 1.0, (3, 4, 5), limit, 3.5)
         assert layout.hits.size == 0 and not layout.fill().any()
         into = [np.zeros_like(a) for a in (model[0], model[1], model[2], model[3])]
         layout.backward(np.ones((3, 4, 5), np.float32), *into)
@@ -155,7 +155,7 @@ def test_any_gaussian_is_finite(
     (means, _, rotations, _), _ = _model(np.random.default_rng(seed), 1)
     means[0] = x, 0.3, z
     model = (means, np.array([[a, b, c]], np.float32), rotations, np.ones(1, np.float32))
-    layout = Layout(*model, (-4.0, -3.0, -2.0), (edge, 1.0, 1.0), (5, 7, 9), 1e-6, 3.5, kernel)
+    layout = Layout(model, (-4.0, -3.0, -2.0), (edge, 1.0, 1.0), (5, 7, 9), 1e-6, 3.5, kernel)
     volume = layout.fill()
     assert np.isfinite(volume).all() and volume.min() >= 0 and volume.max() <= 1.0001
     into = [np.zeros(s, np.float32) for s in ((1, 3), (1, 3), (1, 9), (1,))]

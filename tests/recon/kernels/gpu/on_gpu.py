@@ -82,7 +82,7 @@ def raw_of(g: Gaussians, device: torch.device) -> tuple[Tensor, ...]:
 
 
 def reference_view(g: Gaussians, geometry: Geometry, view: int) -> Tensor:
-    return reference.project_view(g.means, g.scales, g.quaternions, g.densities, geometry, view)
+    return reference.project_view((g.means, g.scales, g.quaternions, g.densities), geometry, view)
 
 
 def assert_gradients(found: tuple[Tensor, ...], double: Gaussians, relative: float = 2e-5) -> None:

@@ -60,7 +60,7 @@ def test_the_uncorrected_factor_equals_the_references(make: object, random_gauss
     plain = RayModel(rectified=False)
     found = project_raw(*raw, UNIT, geometry, *WHOLE, plain)[0]
     physical = (double.means, double.scales, double.quaternions, double.densities)
-    expected = reference.project_view(*physical, geometry, 0, length=plain.length(geometry))
+    expected = reference.project_view(physical, geometry, 0, length=plain.length(geometry))
     assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
     (found * found).sum().backward()
     (expected * expected).sum().backward()

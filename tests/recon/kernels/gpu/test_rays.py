@@ -32,7 +32,7 @@ def test_exact_rays_and_gradients_equal_the_reference(random_gaussians: Make) ->
         raw, double = raw_of(g, DEVICE), in_double(g)
         found = project_raw(*raw, UNIT, geometry, *WHOLE, RayModel(exact_above=worst))[0]
         physical = (double.means, double.scales, double.quaternions, double.densities)
-        expected = reference.project_view(*physical, geometry, 0, exact=errors > worst)
+        expected = reference.project_view(physical, geometry, 0, exact=errors > worst)
         assert float((found.detach().cpu() - expected.detach()).abs().max()) < 5e-6 * float(expected.detach().max())
         weights = torch.from_numpy(np.random.default_rng(3).normal(size=expected.shape))
         (found * weights.float().to(DEVICE)).sum().backward()

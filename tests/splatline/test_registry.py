@@ -10,8 +10,8 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from drivers import plugins as module
-from drivers.plugins import plugins
+from splatline import registry as module
+from splatline.registry import Registry, UnknownNameError, plugins
 
 
 @pytest.fixture
@@ -96,8 +96,35 @@ def test_ctrl_c_while_a_plug_in_loads_ends_the_command(announced: list[EntryPoin
         plugins("reader", (), made)
 
 
+def test_a_registry_is_ours_with_the_additions_and_asks_for_them_at_its_first_use(
+    announced: list[EntryPoint],
+) -> None:
+    registry = Registry("volume_format", {"two": 2.0}, lambda name, found: found / 2, reserved=("auto",))
+    announced += [_point(name, "math:tau", "volume_format") for name in ("pi", "auto")]
+    with pytest.warns(UserWarning, match="'auto'.*taken by splatline"):
+        assert dict(registry) == {"two": 2.0, "pi": math.pi}
+    assert registry.ours == {"two": 2.0} and len(registry) == 2 and "auto" not in registry
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("tow", "volume format 'tow' is unknown; legal: two, three (did you mean two?)"),
+        ("ten", "volume format 'ten' is unknown; legal: two, three"),
+    ],
+)
+def test_a_name_that_there_is_not_is_told_with_those_that_there_are(
+    announced: list[EntryPoint], name: str, said: str
+) -> None:
+    registry = Registry("volume_format", {"two": 2, "three": 3})
+    with pytest.raises(UnknownNameError) as unknown:
+        registry[name]
+    assert str(unknown.value) == said and isinstance(unknown.value, ValueError)
+    assert registry.get(name) is None and name not in registry
+
+
 def test_help_looks_for_no_plug_in() -> None:
     code = "import sys; from beamline.cli.main import run; sys.argv = ['beamline', '--help']\n"
-    code += "try: run()\nexcept SystemExit: print('drivers.plugins' in sys.modules)"
+    code += "try: run()\nexcept SystemExit: print('splatline.registry' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "False"

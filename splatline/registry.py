@@ -1,0 +1,143 @@
+"""Registry: what there is of a kind, by name: ours, and what other installed packages add by entry points.
+
+Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check or
+effect; the entry point's name is the name of the addition.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import redirect_stdout
+from functools import cache, cached_property
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+_PREFIX = "splatline."
+_NEAR = 0.65  # of 1: from which likeness on a name may have been meant
+
+T = TypeVar("T")
+
+
+def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
+    """The sentence on a name that there is not, with those that there are, and the nearest. It ends without a stop.
+
+    Args:
+        kind: what the name is of, such as "method".
+    """
+    names = list(legal)
+    near = nearest(name, names)
+    meant = f" (did you mean {near}?)" if near else ""
+    return f"{kind} {name!r} is unknown; legal: {', '.join(names) or 'none'}{meant}"
+
+
+def nearest(name: object, legal: Iterable[str]) -> str:
+    """The legal name that was probably meant; "" if none is near."""
+    from difflib import get_close_matches  # here: only errors need it
+
+    return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_NEAR)), "")
+
+
+class UnknownNameError(ValueError, KeyError):
+    """A registry has no entry of this name."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """The entries of a kind, by name: ours first, then those of other packages in the order of their names.
+
+    Other packages are asked at the first use, so that programs without it start quickly.
+
+    Args:
+        kind: of its entries, as above.
+        ours: our own.
+        made: makes an entry from the name and the object of an entry point; ValueError if the object does not fit.
+        reserved: names that no addition may have, beside ours.
+
+    Raises (where a name is looked up):
+        UnknownNameError: there is none of this name; the message has all names.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        ours: Mapping[str, T],
+        made: Callable[[str, Any], T] = lambda name, found: found,
+        reserved: Collection[str] = (),
+    ) -> None:
+        self.kind, self.ours, self._made, self._reserved = kind, ours, made, reserved
+
+    @cached_property
+    def _entries(self) -> Mapping[str, T]:
+        return {**self.ours, **plugins(self.kind, (*self.ours, *self._reserved), self._made)}
+
+    def __getitem__(self, name: str) -> T:
+        try:
+            return self._entries[name]
+        except KeyError:
+            raise UnknownNameError(unknown(self.kind.replace("_", " "), name, self._entries)) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+
+def plugins(
+    kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
+) -> dict[str, Any]:
+    """The additions of other packages to a registry, by name, in the order of the names.
+
+    Args:
+        kind: of the registry, as above.
+        taken: names that the registry has itself.
+        made: makes the registry's entry from a name and the loaded object; ValueError if the object does not fit.
+
+    Warns:
+        UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
+    """
+    announced = sorted(point for point in _announced() if point.group == _PREFIX + kind)
+    times, found = Counter(point.name for point in announced), dict[str, Any]()
+    for point in announced:
+        try:
+            if point.name in taken or times[point.name] > 1:
+                by = "splatline" if point.name in taken else "another plug-in"
+                raise ValueError(f"the name is taken by {by}; expected a name of its own")
+            with redirect_stdout(sys.stderr):  # stdout is for results
+                found[point.name] = made(point.name, point.load())
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # another package's fault must not stop a scan
+            package = f" of the package {point.dist.name}" if point.dist is not None else ""
+            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {_said(error)}"
+            warnings.warn(
+                f"The {kind.replace('_', ' ')} {_one_line(told)}. Mend or uninstall that package; all else works "
+                "without it.",
+                stacklevel=2,
+            )
+    return found
+
+
+def _said(error: BaseException) -> str:
+    try:
+        return str(error)
+    except BaseException as again:  # from the text of another package's error, too
+        return f"it does not say why ({type(again).__name__})"
+
+
+def _one_line(text: str) -> str:
+    """The text without control characters, which would act on a terminal or begin a line of a log; not too long."""
+    line = " ".join(text[:1000].split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+@cache
+def _announced() -> tuple[EntryPoint, ...]:
+    """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
+    found = entry_points()
+    return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))
