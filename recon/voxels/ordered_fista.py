@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.empirical import LEAST_OF_SUBSET, LEAST_SUBSETS
+from recon.base.empirical import LEAST_OF_SUBSET
 from recon.base.geometry import Geometry
 from recon.kernels.cpu.vectors import combine, replace_by_residual
 from recon.voxels.noise_balance import NoiseBalance
@@ -39,7 +39,7 @@ class Subsets:
 
     @classmethod
     def of(cls, problem: VoxelProblem, most: int) -> Subsets:
-        """At most so many; each has at least twelve views, if that leaves three."""
+        """At most so many; each has at least twelve views."""
         projector, weight = problem.projector, problem.weight
         count = subsets_of(projector.geometry, most)
         if count == 1:
@@ -99,4 +99,4 @@ def ordered_fista(
 
 def subsets_of(geometry: Geometry, most: int) -> int:
     """Number of subsets that `Subsets.of` makes of these views."""
-    return max(1, min(most, geometry.n_views, max(LEAST_SUBSETS, geometry.n_views // LEAST_OF_SUBSET)))
+    return max(1, min(most, geometry.n_views // LEAST_OF_SUBSET))

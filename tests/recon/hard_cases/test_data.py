@@ -231,9 +231,9 @@ def test_a_fit_takes_angles_in_any_order_and_range(clean: F32, truth: F32) -> No
     order = rng.permutation(32)
     odd = Geometry.parallel(VIEWS.angles[order] + 2 * math.pi * rng.integers(-9, 10, 32), SHAPE)
     # The views that a step draws differ, too: over seeds a fit's PSNR scatters by 0.17 dB, a difference of two means of
-    # three by 0.14.
+    # twelve by 0.07.
     plain, mixed = (
-        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(3)])
+        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(12)])
         for data, views in ((clean, VIEWS), (clean[order], odd))
     )
     assert abs(plain - mixed) < 0.5

@@ -30,16 +30,16 @@ def data() -> np.ndarray:
 def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     grid = Grid.matching(views)
-    # 24 views in three subsets, a look a tick: 3 ticks of views, 3 steps of total variation; before the first sweep 5,
+    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6,
     # and four trials of 16 over seven of eight views where time is left for these.
     found = [
-        finish_within(s, 0.0, views, grid, SteppedClock(tick=1.0)) for s in (0.0, 41.0, 42.0, 77.0, 413.0, 414.0, 1e3)
+        finish_within(s, 0.0, views, grid, SteppedClock(tick=1.0)) for s in (0.0, 39.0, 40.0, 69.0, 349.0, 350.0, 1e3)
     ]
-    none, trials = [(0, 0.0, True)] * 2, [(8, 414.0, True)] * 2
-    assert found == [*none, (2, 42.0, False), (7, 72.0, False), (8, 78.0, False), *trials]
+    none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
+    assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
     # With patches, where time is left for their 35 steps, for the trials of total variation and for those of patches.
-    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (1022.0, 1023.0)]
-    assert found == [(8, 414.0, True), (None, 1023.0, True)]
+    found = [finish_within(2e3, spare, views, grid, SteppedClock(tick=1.0)) for spare in (857.0, 858.0)]
+    assert found == [(8, 350.0, True), (None, 857.5, True)]
 
 
 @pytest.mark.slow
