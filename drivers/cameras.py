@@ -7,7 +7,7 @@ from typing import Any, Protocol
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.stages.settings import with_keys
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 
 class CameraDriver(Protocol):

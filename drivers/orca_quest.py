@@ -11,7 +11,7 @@ from __future__ import annotations
 from types import MappingProxyType
 
 from drivers.base.protocols import CameraSettings, CameraTiming
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)
 PITCH_MM = 4.6e-3

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from recon.base.choices import AUTO
 from recon.base.method import Method
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 
 @dataclass(frozen=True)

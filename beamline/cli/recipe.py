@@ -19,7 +19,7 @@ from click.core import ParameterSource
 from beamline.cli.options import Declared, name_of
 from beamline.cli.options import option as declared_option
 from beamline.core.files import SETTINGS, require_regular, text_in
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 _RAW = "beamline.raw"
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are

@@ -31,8 +31,8 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown, print_dry_run
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
+from recon.base.registry import unknown
 from recon.methods import names_compared, names_of_one_volume
-from splatline.registry import unknown
 
 
 def listed(value: str) -> tuple[str, ...]:

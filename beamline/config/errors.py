@@ -9,7 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.config.tree import KeyPath, Tree
-from splatline.registry import nearest
+from recon.base.registry import nearest
 
 Schema = Mapping[str, Any]
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours

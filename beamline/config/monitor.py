@@ -16,7 +16,7 @@ from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
 from beamline.monitor.checks import BY_NAME, CHECKS
 from beamline.monitor.references import ReferenceLimits
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 
 def _names(retake: bool | tuple[str, ...]) -> bool | tuple[str, ...]:

@@ -11,7 +11,7 @@ from dataclasses import fields
 from importlib import import_module
 
 from beamline.monitor.check import Check, Flag, Level
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
 BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one first

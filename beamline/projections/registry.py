@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from beamline.projections.protocols import PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
 from beamline.projections.step import StepDone, key_of, options_of
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection

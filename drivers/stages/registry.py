@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from drivers.stages.settings import StageDriver, with_keys
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 REGISTRY = {  # kind, as a configuration names it: class in the kind's module `stage`
     "pm16c": "PM16CStage",

@@ -9,7 +9,7 @@ from dataclasses import fields
 from types import MappingProxyType
 from typing import Any
 
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 _Kind = tuple[Mapping[str, Any], Callable[[Any, Any], bool], Callable[[Any], str]]
 """Bounds by name, whether a value is within one, and what is expected."""

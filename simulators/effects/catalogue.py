@@ -13,7 +13,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 
 class Domain(IntEnum):

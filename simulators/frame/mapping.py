@@ -22,7 +22,7 @@ from pydantic import (
     create_model,
 )
 
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

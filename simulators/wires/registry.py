@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 
 from drivers.flat import flat_fields
+from recon.base.registry import Registry
 from simulators.wires.wire import Build
-from splatline.registry import Registry
 
 REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's module `wire`
     "pm16c": "PM16CBuild",

@@ -12,7 +12,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.projections.selection import geometry_of, pivot_of, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
-from splatline.registry import unknown
+from recon.base.registry import unknown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -32,7 +32,7 @@ from beamline.storage.readers.wrapped import (
     type_wrapped,
 )
 from drivers.base.frame import FrameKind
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 

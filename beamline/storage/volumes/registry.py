@@ -10,7 +10,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from splatline.registry import Registry
+from recon.base.registry import Registry
 
 if TYPE_CHECKING:
     from beamline.storage.volumes.base import VolumeFormat

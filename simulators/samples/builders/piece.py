@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar, Protocol
 
 from pydantic import Field
 
+from recon.base.registry import unknown
 from simulators.samples.bodies.solids import LEAST, MOST, Solid
-from splatline.registry import unknown
 
 Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
 Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]

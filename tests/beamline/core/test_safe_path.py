@@ -16,7 +16,7 @@ from beamline.scan.run_folder import CONFIG
 from beamline.scan.watchdog import watched
 from beamline.trials.launch import command as trial
 
-OURS = ("beamline", "drivers", "recon", "simulators", "splatline")
+OURS = ("beamline", "drivers", "recon", "simulators")
 TAKEN = {*sys.stdlib_module_names} - {*sys.builtin_module_names} | {*OURS, "numpy", "h5py", "serial", "yaml"}
 
 

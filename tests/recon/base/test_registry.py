@@ -9,9 +9,9 @@ import sys
 from importlib.metadata import EntryPoint
 
 import pytest
-
 from splatline import registry as module
-from splatline.registry import Registry, UnknownNameError, plugins
+
+from recon.base.registry import Registry, UnknownNameError, plugins
 
 
 @pytest.fixture
@@ -125,6 +125,6 @@ def test_a_name_that_there_is_not_is_told_with_those_that_there_are(
 
 def test_help_looks_for_no_plug_in() -> None:
     code = "import sys; from beamline.cli.main import run; sys.argv = ['beamline', '--help']\n"
-    code += "try: run()\nexcept SystemExit: print('splatline.registry' in sys.modules)"
+    code += "try: run()\nexcept SystemExit: print('recon.base.registry' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "False"

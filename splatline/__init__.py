@@ -1,1 +1,0 @@
-"""What every package of the project may use: registries, which other packages add to. Standard library alone."""
