@@ -97,8 +97,8 @@ class FitSettings:
 def in_steps(settings: FitSettings, steps: float) -> FitSettings:
     """The settings of a fit of so many steps, where these are more than `paced_for`.
 
-    Its rates fall with their square root, and so does the least weight of total variation, which a short fit needs to
-    be smooth.
+    Its rates fall with their square root. So does the least weight of total variation, which a short fit needs to be
+    smooth.
     """
     share = share_of_prior(settings, steps)
     return replace(settings, pace=share * settings.pace, tv_least=share * settings.tv_least)

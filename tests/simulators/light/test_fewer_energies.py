@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from simulators.light import spectrum
 from simulators.light.spectrum import fewer
 
 Reals = NDArray[np.float64]
@@ -60,7 +59,7 @@ def test_a_long_table_takes_no_longer_than_its_rays(monkeypatch: pytest.MonkeyPa
         solved.append(a.shape[1])
         return nnls(a, b)
 
-    monkeypatch.setattr(spectrum, "nnls", counted)
+    monkeypatch.setattr("scipy.optimize.nnls", counted)
     energies = np.linspace(5, 100, 600)
     weights = np.random.default_rng(0).dirichlet(np.ones(600))
     attenuation = np.stack([(energies / 20) ** -3 + 0.02, 8 * (energies / 20) ** -2.7 + 0.1], axis=1)

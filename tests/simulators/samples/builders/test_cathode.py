@@ -138,8 +138,8 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
         ({"gap_um": 1e308}, "gap_um must be less than or equal to 1000000000000"),
         ({"gap_um": 100.0}, "a gap of 100 um between .* is more than .* have room for"),
         ({"habits": {"sphere": 1e308, "plate": 1}}, r"habits\.sphere must be less than"),
-        ({"made_of": {"lid": "Al"}}, "'lid' is no part"),
-        ({"attenuation": {"lid": 1.0}}, "'lid' is no part"),
+        ({"made_of": {"lid": "Al"}}, "part of this phantom 'lid' is unknown"),
+        ({"attenuation": {"lid": 1.0}}, "part of this phantom 'lid' is unknown"),
         ({"made_of": {"wall": "steel"}}, "need a beam with energies"),
     ],
 )

@@ -110,7 +110,7 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
         ({"gap_um": 1e308}, "gap_um must be less than or equal to 1000000000000"),
         ({"n_holes": 10**30}, "n_holes must be less than or equal to 200000"),
         ({"candidates": 10**30}, "candidates must be less than or equal to 10000000"),
-        ({"attenuation": {"foam": 1.0}}, "'foam' is no part"),
+        ({"attenuation": {"foam": 1.0}}, "part of this phantom 'foam' is unknown"),
     ],
 )
 def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:

@@ -112,7 +112,7 @@ def test_a_pattern_may_have_one_kind_only() -> None:
         ({"balls_um": [1.0] * 101}, "100 widths and balls at most, got 2 and 101"),
         ({"star_um": 1e308}, "star_um must be less than"),
         ({"widths_um": [1e-300]}, r"widths_um\[0\] must be greater than"),
-        ({"made_of": {"wedge": "Al"}}, "'wedge' is no part"),
+        ({"made_of": {"wedge": "Al"}}, "part of this phantom 'wedge' is unknown"),
     ],
 )
 def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
