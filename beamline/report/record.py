@@ -82,10 +82,11 @@ def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
     if judged is None or views_grew(made) or "resumed_from" in settings:
         return None
     if "pace" in settings:  # of a fit
-        usual = FitSettings()
-        if settings["pace"] != usual.pace or settings.get("decay", usual.decay) != usual.decay:
+        usual, steps = FitSettings(), made.history[-1].step
+        slower = settings["pace"] < usual.pace and steps > usual.paced_for  # as in every longer fit
+        if not (slower or settings["pace"] == usual.pace) or settings.get("decay", usual.decay) != usual.decay:
             return None
-        return next_decibel_of_fit(made.history[-1].seconds, made.history[-1].step)
+        return next_decibel_of_fit(made.history[-1].seconds, steps)
     return next_decibel(judged.seconds, judged.residuals)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,8 @@ def test_defaults_and_results(folder: Path) -> None:
     assert result.exit_code == 0, result.output
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html"}
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines()[:4])
+    lines["report"], seconds = lines["report"].split(maxsplit=1)
+    assert re.fullmatch(r"\(\d+\.\d s\)", seconds)
     assert lines == {
         "output": "scan_fbp.h5",
         "report": "scan_fbp.html",

@@ -67,5 +67,5 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
         (finding,) = frames_flagged(source, judged)
         taken = usable_views(source, True, judged)
     assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
-    assert taken.in_words.startswith(said)
+    assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)
