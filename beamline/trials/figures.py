@@ -218,6 +218,6 @@ COLOURS: Mapping[str, str] = {
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
     "pnp-dct": "maroon",
     "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
-    "series": "darkgreen", "materials": "darkgreen",
+    "series": "darkgreen", "materials": "slateblue",
 }  # fmt: skip
 _SPARE = ("tab:pink", "black")
