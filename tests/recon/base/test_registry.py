@@ -9,8 +9,8 @@ import sys
 from importlib.metadata import EntryPoint
 
 import pytest
-from splatline import registry as module
 
+from recon.base import registry as module
 from recon.base.registry import Registry, UnknownNameError, plugins
 
 

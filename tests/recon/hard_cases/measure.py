@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import Kernel, project, voxelize
+from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import as_leaves, gradients, in_double
 
 WHOLE = Truncation(sigmas=9.0, faint=1e-12)  # so that kernel and reference sum the same terms
