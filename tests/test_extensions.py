@@ -19,7 +19,7 @@ import pytest
 from tests.extension_dummies import EXTENSIONS
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("beamline", "recon", "drivers", "simulators", "splatline", "configs")
+PACKAGES = ("beamline", "recon", "drivers", "simulators", "configs")
 
 
 # Each proof in a namespace of its own; the last line printed says which failed, and how.

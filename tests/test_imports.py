@@ -7,7 +7,7 @@ from graphlib import TopologicalSorter
 import grimp
 import pytest
 
-PACKAGES = ("beamline", "recon", "drivers", "simulators", "splatline")
+PACKAGES = ("beamline", "recon", "drivers", "simulators")
 JUMPS = "beamline.projections.corrections.jumps"
 
 

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 def classes() -> dict[str, list[str]]:
     """Where each public class of the four packages is defined, and each Protocol, enumeration and value type."""
     found: dict[str, list[str]] = defaultdict(list)
-    for package in ("beamline", "recon", "drivers", "simulators", "splatline"):
+    for package in ("beamline", "recon", "drivers", "simulators"):
         for path in sorted((ROOT / package).rglob("*.py")):
             for node in ast.parse(path.read_text(encoding="utf-8")).body:
                 if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
