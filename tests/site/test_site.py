@@ -110,6 +110,7 @@ with warnings.catch_warnings(record=True) as told:
     from beamline.projections.registry import all_steps
     steps = [step.name for step in all_steps()]
     from simulators.wires.registry import WIRES
+    wires = list(WIRES)  # plug-ins are looked up when a registry is first asked
 
 left_out = {str(one.message).split(" was left out")[0] for one in told if "left out" in str(one.message)}
 package = "of the package site-of-an-instrument"
