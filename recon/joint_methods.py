@@ -118,7 +118,9 @@ class EnergySeries:
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "states", tuple(self.states))
         if not self.materials or len(set(self.materials)) < len(self.materials):
-            raise ValueError(f"materials must be names that differ, got {', '.join(self.materials) or 'none'}")
+            raise ValueError(
+                f"materials must be distinct names, at least one, got {', '.join(self.materials) or 'none'}"
+            )
         two = len(self.states) == 2 and len(set(self.states) & set(self.materials)) == 2
         if self.states and not two:
             raise ValueError(
@@ -235,7 +237,7 @@ def _progress(n: int, of: int, unit: str) -> Progress:
 
 def _require_own_grid(problem: ReconProblem) -> None:
     if problem.grid != Grid.matching(problem.geometry):
-        raise ValueError("several volumes of the same views have the grid of these: leave out another one")
+        raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
 
 
 def _bytes_of(geometry: Geometry) -> int:

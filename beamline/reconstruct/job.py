@@ -57,12 +57,12 @@ class Job:
 
     @property
     def grid(self) -> Grid:
-        """Of the volume; a direct method takes the voxels of a region alone."""
+        """Grid of the volume; of a region alone for a direct method."""
         grid = Grid.matching(self.prepared.geometry)
         return self.region.grid_of(grid) if self.region is not None and self.options.method.traits.direct else grid
 
     def say(self, text: str) -> None:
-        """Tell what a slab has come to."""
+        """Report the progress of a slab."""
         self.sink(StateEntered("slab", text, time=self.clock.now()))
 
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
@@ -70,7 +70,7 @@ class Job:
 
     @contextmanager
     def refused(self, by: str = "") -> Iterator[None]:
-        """Turns a ValueError into a DataError that names the file."""
+        """Turn a ValueError into a DataError that names the file."""
         try:
             yield
         except ValueError as error:

@@ -19,11 +19,11 @@ from recon.prep.correct import Projections
 from recon.voxels.slices import orthogonal_slices
 
 _FEWEST, _BEFORE_AXIS = 8, 32  # views; of them, those that are corrected before the axis is known
-_WHOLE = 1.0  # degrees of the half turn that may lack
+_WHOLE = 1.0  # degrees of the half turn that may be missing
 
 
 class LiveSlices:
-    """Draws the slices when there are new views and enough time has passed; at most half of it is spent on them."""
+    """Draws the slices when there are new views and enough time has passed; drawing takes at most half of the time."""
 
     def __init__(self, views: FollowedViews, snapshots: Snapshots, clock: Clock) -> None:
         self._views, self._snapshots, self._clock = views, snapshots, clock
@@ -36,7 +36,7 @@ class LiveSlices:
 
         Args:
             pause: s until they are drawn again, at least; None: they are drawn now.
-            of: so many views are there, of which these are some; 0: these.
+            of: number of views so far, of which `parts` holds some; 0: all of them.
         """
         n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
         if n < _FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:

@@ -15,7 +15,7 @@ from recon.base.choices import AUTO
 
 @dataclass(frozen=True)
 class OptionRule:
-    """What an option is of, and what it goes with.
+    """Which methods or value an option belongs to, and what it excludes or needs.
 
     Attributes:
         setting: of the methods with this setting, by its path in Python, such as `fit.loss`.
@@ -40,7 +40,7 @@ class OptionRule:
 
 
 AXIS_TRIALS, SLABS = "axis try", "resume of slabs"
-"""Values of options that have rules of their own: several axes to try, and a partial volume to go on from."""
+"""Stand for `--axis try`, and for `--resume` of a partial volume, which have rules of their own."""
 OF_ONE_VOLUME = {
     "roi": "a box is of one volume",
     "truth": "a truth is compared with one volume",
@@ -51,13 +51,14 @@ OF_ONE_VOLUME = {
 
 _FINISHED = {"follow": "it is for a finished scan"}
 _BY_BUDGET = {"budget": "--budget chooses it"}
+_NOT_KEPT = {"budget": "a run within a budget keeps no checkpoints", **_FINISHED}
 _PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
 _BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
 _RUNNING = ("follow", "is for a scan that still runs: give --follow.")
-_IN_MEMORY = dict.fromkeys(("follow", "budget"), "it holds everything in memory")
+_IN_MEMORY = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
 _PICTURE = {AXIS_TRIALS: "that writes a picture of slices, and nothing else"}
 _FOR_TIME = dict.fromkeys(
-    ("follow", "budget", "seconds", AXIS_TRIALS), "refits need the whole scan, and time of their own"
+    ("follow", "budget", "seconds", AXIS_TRIALS), "error bars need the whole scan, and time for refits"
 )
 
 RULES: Mapping[str, OptionRule] = {
@@ -72,8 +73,8 @@ RULES: Mapping[str, OptionRule] = {
     "device": OptionRule(trait="device", value="device", excludes={**_BY_BUDGET, **_FINISHED}),
     "early-stop": OptionRule("early_stop", excludes={**_BY_BUDGET, **_FINISHED}),
     "finish": OptionRule("finish", excludes={**_PLANNED, **_FINISHED}),
-    "checkpoint": OptionRule(trait="checkpoints", value="checkpoints.path", excludes={**_BY_BUDGET, **_FINISHED}),
-    "resume": OptionRule(trait="checkpoints", value="checkpoints.resume", excludes={**_BY_BUDGET, **_FINISHED}),
+    "checkpoint": OptionRule(trait="checkpoints", value="checkpoints.path", excludes=_NOT_KEPT),
+    "resume": OptionRule(trait="checkpoints", value="checkpoints.resume", excludes=_NOT_KEPT),
     "iterations": OptionRule("iterations", excludes=_BY_BUDGET),
     "tv-weight": OptionRule("tv_weight"),
     "patch-threshold": OptionRule("patch_threshold"),
@@ -90,7 +91,9 @@ RULES: Mapping[str, OptionRule] = {
     "plain-splatting": OptionRule("fit.rays.rectified", inverted=True, excludes=_BY_BUDGET),
     "uncertainty": OptionRule(value="uncertainty", excludes=_FOR_TIME),
     "truth": OptionRule(value="truth"),
-    "follow": OptionRule(excludes={SLABS: "these slabs are of a finished scan", AXIS_TRIALS: "they need all views"}),
+    "follow": OptionRule(
+        excludes={SLABS: "these slabs are of a finished scan", AXIS_TRIALS: "trials of the axis need all views"}
+    ),
     "earlier": OptionRule(needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts.")),
     "enough-loss": OptionRule(value="enough.psnr_loss", needs=_RUNNING),
     "enough-gain": OptionRule(value="enough.psnr_gain_per_10_views", needs=_RUNNING),
@@ -102,12 +105,12 @@ RULES: Mapping[str, OptionRule] = {
         excludes={
             "follow": "it is for a finished scan",
             "truth": "a truth is compared with the whole volume",
-            AXIS_TRIALS: "they draw whole slices",
+            AXIS_TRIALS: "trials of the axis draw whole slices",
         },
     ),
     "log": OptionRule(excludes=_PICTURE),
     "dry-run": OptionRule(
-        excludes={"follow": "a scan that runs takes its own time", "budget": "it says the time itself", **_PICTURE}
+        excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time", **_PICTURE}
     ),
     SLABS: OptionRule(value="partial"),
 }

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
-    """The sentence on a name that there is not, with those that there are, and the nearest. It ends without a stop.
+    """The message for an unknown name, with the legal names and the nearest one; without a full stop.
 
     Args:
         kind: what the name is of, such as "method".

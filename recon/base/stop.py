@@ -17,7 +17,8 @@ class Stop:
         now: the clock.
 
     Attributes:
-        stopped: somebody asked for the end; the deadline alone does not count, because it was planned.
+        stopped: somebody asked for the end; the deadline alone does not count, because it was planned. Of one
+            made by `by` the deadline of the first counts as asked for.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class Stop:
         return type(self)(self, deadline, now)
 
     def leaves(self, seconds: float) -> bool:
-        """Whether so many s are left before the deadline."""
+        """Whether so many s are left before this one's own deadline."""
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:

@@ -74,14 +74,17 @@ def orthogonal_slices(views: Sequence[F32], geometry: Geometry) -> OrthogonalSli
 
 
 def _binned(view: F32, factor: int) -> F32:
-    """Means of factor x factor pixels; what is left over at the ends is left out."""
+    """Means [row, col] of factor x factor pixels; what is left over at the ends is left out."""
     rows, cols = (n // factor * factor for n in view.shape)
     down = np.add.reduce([view[k:rows:factor, :cols] for k in range(factor)])
     return np.asarray(np.add.reduce([down[:, k::factor] for k in range(factor)]) / np.float32(factor**2))
 
 
 def _along(data: F32, geometry: Geometry, points: F64) -> F32:
-    """FBP [point, row] on lines along the axis through points (x, y) [2, point] in mm, with the weights of `fbp`."""
+    """FBP float32 [point, row] (1/mm) of line integrals [view, row, col], with the weights of `fbp`.
+
+    It is on lines along the axis, through points (x, y) [2, point] in mm.
+    """
     weights, zeros = ray_weights(geometry)
     shares, pitch = weights.astype(np.float32)[:, None], geometry.pixel_pitch
     out = np.zeros((points.shape[1], data.shape[1]), np.float32)
