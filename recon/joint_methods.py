@@ -140,6 +140,8 @@ class EnergySeries:
         _require_own_grid(problem)
         n = problem.geometry.n_views
         energies = problem.use.energies or Energies(np.zeros(n, np.intp), np.ones((1, 1)))
+        if not (energies.cross_sections >= 0).all():
+            raise ValueError(f"cross sections must be 0 or more, got {energies.cross_sections.min():g}")
         if energies.cross_sections.shape[1:] != (self.volumes,):
             raise ValueError(
                 f"cross_sections have shape {energies.cross_sections.shape}; expected a column for each of "
@@ -246,12 +248,18 @@ def _bytes_of(geometry: Geometry) -> int:
 
 
 def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
-    """Line integrals [view, row, col], 0 and without weight where nothing was measured; and the weights."""
+    """Line integrals [view, row, col], 0 and without weight where nothing was measured; and the weights, of one shape.
+
+    Raises:
+        ValueError: no line integral that was measured is above 0.
+    """
     data, weights = problem.projections, problem.use.weights
     if not (finite := np.isfinite(data)).all():
         weights = finite.astype(np.float32) if weights is None else weights * finite
     if weights is not None:
         data = np.where(weights > 0, data, np.float32(0))
+    if not data.max() > 0:
+        raise ValueError("no line integral that is finite and has a weight is above 0: these views hold no matter")
     return data, weights
 
 
