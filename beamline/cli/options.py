@@ -122,6 +122,14 @@ json_option = option(
 )  # fmt: skip
 seed_option = option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
 dataset_option = option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
+
+
+def new_folder_option(default: str) -> Decorator:
+    """The folder of a command that writes several files; `default` says which one it is without the option."""
+    where = click.Path(path_type=Path, file_okay=False)
+    return option("-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in this folder.")
+
+
 dry_option = option(
     "--dry-run", "dry", is_flag=True, repeated=False,
     help="Print what would run, the time and memory it will take and what would be written, and end.",

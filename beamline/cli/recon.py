@@ -34,7 +34,7 @@ from beamline.core.files import write_whole
 from beamline.core.process import EndsWithParent
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
-from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS, of_other_methods
+from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
@@ -99,14 +99,14 @@ def _checked_method(context: click.Context, method: str | None, axes: AxisRange 
     """
     asked, rules = names_given(context) | ({AXIS_TRIALS} if axes is not None else set()), rules_of(context.command)
     if slabs is not None:
-        asked = asked - {"resume"} | {SLABS}
+        asked = asked - {"resume"} | {SLABS_RESUMED}
     values = context.params
     method = preset_of(method, values["preset"])
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
         method = IN_TIME if "time" in asked else DEFAULT if of_fits else AUTO
-    refuse_contradictions(context.command, asked, {SLABS: f"--resume {slabs}"})
+    refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {slabs}"})
     if why := of_other_methods(rules, asked, method):
         raise click.UsageError(why)
     for step in chosen_steps(values) if values["follow"] else ():

@@ -15,6 +15,7 @@ from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
     dry_option,
     json_option,
+    new_folder_option,
     others,
     refuse_contradictions,
     scan_argument,
@@ -76,13 +77,7 @@ class StudyRequest:
     )
     seed: int = set_by(seed_option)
     dry: bool = set_by(dry_option)
-    output: Path | None = set_by(
-        heading(OUTPUT),
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path, file_okay=False),
-        help="New folder for the results. Default: FILE's stem and the study's name, in this folder.",
-    )
+    output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem and the study's name"))
     as_json: bool = set_by(json_option)
 
 

@@ -18,6 +18,7 @@ from beamline.cli.options import (
     dry_option,
     json_option,
     names_in,
+    new_folder_option,
     others,
     parsed,
     refuse_contradictions,
@@ -105,13 +106,7 @@ class TradeoffRequest:
     )
     dry: bool = set_by(dry_option)
     seed: int = set_by(heading(METHOD), seed_option)
-    output: Path | None = set_by(
-        heading(OUTPUT),
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path, file_okay=False),
-        help="New folder for the results. Default: FILE's stem + _tradeoff, in this folder.",
-    )
+    output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem + _tradeoff"))
     as_json: bool = set_by(json_option)
 
 

@@ -24,7 +24,7 @@ _ENDING = (
     "SIGPWR",
 )  # fmt: skip
 """Signals that would end the process, on any system: of a batch system, a time limit, a power failure."""
-_SAID_WITHIN = 0.2  # s
+_PRINTING = 0.2  # s that a message to the terminal may delay the stop
 
 
 @contextmanager
@@ -111,7 +111,7 @@ def _say(text: str) -> None:
     """Print in a thread of its own: a terminal without a reader must not delay the stop of the scan."""
     thread = threading.Thread(target=_print, args=(text,), daemon=True)
     thread.start()
-    thread.join(_SAID_WITHIN)
+    thread.join(_PRINTING)
 
 
 def _print(text: str) -> None:

@@ -120,7 +120,7 @@ def spread(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
 
 
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
-    """float64 [view] radians by which the stage has turned beyond the trigger in the middle of a view's exposure.
+    """float64 [view] radians that the stage has turned past its trigger by the middle of each exposure.
 
     0 for a step scan. A standing stage at this angle shows the same as the view of a fly scan.
     """

@@ -39,7 +39,7 @@ class OptionRule:
         return bool(self.setting or self.trait)
 
 
-AXIS_TRIALS, SLABS = "axis try", "resume of slabs"
+AXIS_TRIALS, SLABS_RESUMED = "axis try", "resume of slabs"
 """Stand for `--axis try`, and for `--resume` of a partial volume, which have rules of their own."""
 OF_ONE_VOLUME = {
     "roi": "a box is of one volume",
@@ -92,7 +92,7 @@ RULES: Mapping[str, OptionRule] = {
     "uncertainty": OptionRule(value="uncertainty", excludes=_FOR_TIME),
     "truth": OptionRule(value="truth"),
     "follow": OptionRule(
-        excludes={SLABS: "these slabs are of a finished scan", AXIS_TRIALS: "trials of the axis need all views"}
+        excludes={SLABS_RESUMED: "these slabs are of a finished scan", AXIS_TRIALS: "trials of the axis need all views"}
     ),
     "earlier": OptionRule(needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts.")),
     "enough-loss": OptionRule(value="enough.psnr_loss", needs=_RUNNING),
@@ -112,7 +112,7 @@ RULES: Mapping[str, OptionRule] = {
     "dry-run": OptionRule(
         excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time", **_PICTURE}
     ),
-    SLABS: OptionRule(value="partial"),
+    SLABS_RESUMED: OptionRule(value="partial"),
 }
 """By the option's name, in the order in which they are looked at."""
 

@@ -46,7 +46,7 @@ class SeveralVolumes:
 
     Attributes:
         volumes: in time, to compare a fit of all of them; 0: none.
-        scans: at several energies, with what pure materials attenuate, the first of which is the scan; None: no others.
+        scans: all scans at several energies, the one compared first, and their cross sections; None: it has one.
         states: names of two materials that are two states of the same one; empty: no such pair.
     """
 

@@ -80,7 +80,7 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset |
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
     """The one detector to read: whose frames are `data`, or which the attributes `default` of file and entry name.
 
-    DataError where there is none, or several could be meant.
+    DataError: there is none, or several fit.
     """
     if not found:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")

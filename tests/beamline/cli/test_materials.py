@@ -86,8 +86,7 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
 def weights_given() -> Iterator[None]:
     """Those that trials find, which take most of the time; tests/recon/test_spectral.py has them."""
     with pytest.MonkeyPatch.context() as patched:
-        given = lambda views, *_: np.full(views.cross_sections.shape[1], 4e-4)  # noqa: E731
-        patched.setattr(spectral, "weights_by_views", given)
+        patched.setattr(spectral, "weights_by_views", lambda views, *_: np.full(views.cross_sections.shape[1], 4e-4))
         yield
 
 

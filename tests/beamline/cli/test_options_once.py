@@ -17,7 +17,7 @@ from beamline.projections.registry import registered
 from beamline.projections.selection import Selection
 from beamline.projections.step import key_of, options_of
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS, OptionRule, takers
+from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS_RESUMED, OptionRule, takers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.region import Region
@@ -46,7 +46,7 @@ VALUES = {
     "region": Region((0, 1), (0, 1), (0, 1)),
 }  # fmt: skip
 """The same in Python, by the path of the setting or of the value."""
-PAIRS = [(name, other) for name, rule in RULES.items() for other in rule.excludes if SLABS not in (name, other)]
+PAIRS = [(name, other) for name, rule in RULES.items() for other in rule.excludes if SLABS_RESUMED not in (name, other)]
 LACKING = [(name, rule.needs[1]) for name, rule in RULES.items() if rule.needs is not None]
 
 
@@ -90,7 +90,7 @@ def test_each_option_is_a_value_in_python_or_of_one_call() -> None:
 @pytest.mark.parametrize("name", RULES)
 def test_a_rule_names_what_is_there(name: str) -> None:
     rule = RULES[name]
-    assert name in OPTIONS or name == SLABS
+    assert name in OPTIONS or name == SLABS_RESUMED
     assert not rule.setting or any(has_setting(by_name(method), rule.setting) for method in takers(rule))
     assert not rule.trait or rule.trait in {each.name for each in fields(Traits)}
     if rule.value:
@@ -98,12 +98,12 @@ def test_a_rule_names_what_is_there(name: str) -> None:
         assert first in {each.name for each in fields(ReconOptions)}
         kind = {"checkpoints": CheckpointOptions, "enough": Goal}.get(first)
         assert not rest or (kind is not None and rest[0] in {each.name for each in fields(kind)})
-    assert set(rule.excludes) | ({rule.needs[0]} if rule.needs else set()) <= {*OPTIONS, AXIS_TRIALS, SLABS}
+    assert set(rule.excludes) | ({rule.needs[0]} if rule.needs else set()) <= {*OPTIONS, AXIS_TRIALS, SLABS_RESUMED}
 
 
 def test_the_command_has_the_rules_of_python_and_no_others() -> None:
     own = {name: rule for name, rule in rules_of(recon).items() if rule != OptionRule()}
-    assert own == {name: rule for name, rule in RULES.items() if rule != OptionRule() and name != SLABS}
+    assert own == {name: rule for name, rule in RULES.items() if rule != OptionRule() and name != SLABS_RESUMED}
 
 
 @pytest.mark.parametrize(("name", "other"), PAIRS)

@@ -46,8 +46,8 @@ def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     assert [outcome.trial.group for outcome in table.outcomes] == ["method", "parts", "parts", *["one fit"] * 3]
 
 
-def at_energies(scans: list[Path], table: Path) -> EnergyScans:  # noqa: F811
-    return EnergyScans(tuple(map(SourceOptions, scans)), read_spectra(table))
+def at_energies(files: list[Path], table: Path) -> EnergyScans:
+    return EnergyScans(tuple(map(SourceOptions, files)), read_spectra(table))
 
 
 def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
