@@ -1,1 +1,1 @@
-"""Devices: their Protocols, and the drivers of real devices."""
+"""Devices of splatline: their Protocols, and the drivers of real devices."""

@@ -1,16 +1,63 @@
 """Flat settings: the fields of nested frozen dataclasses under their own names, as files and options write them.
 
+`key` says with a field how a configuration writes it: its unit, which ends the key's name, legal values and meaning.
 `Wiring` inside `PM16CSettings` is a value of its own; in a file and in a URL its fields stand beside the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, TypeVar, get_args, get_type_hints
 
 T = TypeVar("T")
+ANGULAR = {"deg", "deg_s", "deg_s2"}  # Units of keys whose fields are in radians
+MEGABYTES = "mb"  # The unit of keys whose fields are in bytes
+
+
+@dataclass(frozen=True)
+class Key:
+    """How a configuration writes a field.
+
+    Attributes:
+        unit: ending of the key's name; "" without one.
+        default: in that unit; MISSING if the key is required.
+        doc: its meaning, if the name does not tell.
+        bounds: legal values, by pydantic's names: gt, ge, le, pattern.
+        problem: says what is wrong with a text; "" where nothing is. None: nothing can be.
+    """
+
+    unit: str
+    default: Any
+    doc: str
+    bounds: Mapping[str, Any]
+    problem: Callable[[str], str] | None = None
+
+    def name_of(self, field: str) -> str:
+        return f"{field}_{self.unit}" if self.unit else field
+
+    @property
+    def converted(self) -> bool:
+        """The field is in another unit than the key."""
+        return self.unit in ANGULAR or self.unit == MEGABYTES
+
+    def inside(self, value: Any) -> Any:
+        """A number of the key as the field has it."""
+        if value is None or not self.converted:
+            return value
+        return math.radians(value) if self.unit in ANGULAR else value * 1_000_000
+
+
+def key(
+    default: Any = MISSING, doc: str = "", *, unit: str = "", problem: Callable[[str], str] | None = None, **bounds: Any
+) -> Any:
+    """A dataclass field that a configuration writes; `default` in the key's unit."""
+    written = Key(unit, default, doc, bounds, problem)
+    inside = default if default is MISSING else written.inside(default)
+    return dataclasses.field(default=inside, metadata={"key": written})
 
 
 @dataclass(frozen=True)
@@ -24,8 +71,8 @@ class FlatField:
 
     @property
     def plain(self) -> Any:
-        """The type without None."""
-        if not isinstance(self.type, UnionType):
+        """The type without None; a union of others stays as it is."""
+        if not isinstance(self.type, UnionType) or NoneType not in get_args(self.type):
             return self.type
         (plain,) = (part for part in get_args(self.type) if part is not NoneType)
         return plain

@@ -17,7 +17,7 @@ if sys.platform == "win32":
     def _mapped(size: int) -> mmap.mmap:
         return mmap.mmap(-1, size)
 
-    def _lock(address: int, size: int) -> None:
+    def lock_pages(address: int, size: int) -> None:
         kernel, this = ctypes.WinDLL("kernel32", use_last_error=True), ctypes.c_void_p(-1)
         least, most = ctypes.c_size_t(), ctypes.c_size_t()  # pages that Windows keeps of the process
         if not (
@@ -34,7 +34,7 @@ else:
     def _mapped(size: int) -> mmap.mmap:
         return mmap.mmap(-1, size, mmap.MAP_PRIVATE | mmap.MAP_ANON)
 
-    def _lock(address: int, size: int) -> None:
+    def lock_pages(address: int, size: int) -> None:
         if ctypes.CDLL(None, use_errno=True).mlock(ctypes.c_void_p(address), ctypes.c_size_t(size)):
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number))
@@ -69,7 +69,7 @@ class FrameMemory:
         memory = _mapped(n * slot)
         pages, why = np.frombuffer(memory, np.uint8), ""
         try:
-            _lock(pages.ctypes.data, pages.size)  # until the system gets it back
+            lock_pages(pages.ctypes.data, pages.size)  # until the system gets it back
         except OSError as error:
             why = error.strerror or str(error)
         pages[:: mmap.PAGESIZE] = 0

@@ -1,4 +1,4 @@
-"""ORCA-Quest data sheet: limits of settings and timing, for planning without a camera.
+"""ORCA-Quest: limits of settings and timing by the data sheet, for planning without a camera, and its options.
 
 C15550-20UP (ORCA-Quest): limits and line times from the vendor's property table. C15550-22UP (ORCA-Quest 2) has the
 same sensor. Its line time in ultra quiet follows from 25.4 full frames a second. No public source states that of photon
@@ -8,9 +8,13 @@ in one line time, so row r starts r / 2 line times after row 0.
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+from enum import StrEnum
 from types import MappingProxyType
 
 from drivers.base.protocols import CameraSettings, CameraTiming
+from drivers.flat import MEGABYTES, key
 from recon.base.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)
@@ -74,3 +78,101 @@ def timing(settings: CameraSettings, link: str = "usb3", model: str = MODEL) -> 
         row_period=line / 2 * settings.binning,
         bits=BITS,
     )
+
+
+class TriggerActive(StrEnum):
+    """How an external pulse controls the exposure.
+
+    EDGE starts an exposure of the set length. LEVEL exposes for as long as the pulse lasts. SYNC_READOUT ends one
+    exposure and starts the next without dead time: the first pulse only starts one, so n pulses give n - 1 frames.
+    """
+
+    EDGE = "edge"
+    LEVEL = "level"
+    SYNC_READOUT = "sync_readout"
+
+
+class TriggerMode(StrEnum):
+    """NORMAL: one frame a pulse. START: the first pulse starts a free run, later pulses have no effect."""
+
+    NORMAL = "normal"
+    START = "start"
+
+
+class TriggerPolarity(StrEnum):
+    """The active edge (or level). A camera that was just switched on is set to NEGATIVE."""
+
+    POSITIVE = "positive"
+    NEGATIVE = "negative"
+
+
+class GlobalExposure(StrEnum):
+    """When rows start to expose after a pulse.
+
+    DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all at once; since they are read one after the other,
+    later rows are exposed for longer unless the light is shut off.
+    """
+
+    DELAYED = "delayed"
+    GLOBAL_RESET = "global_reset"
+
+
+class HotPixelMode(StrEnum):
+    """Sensitivity of the camera's own correction of hot pixels."""
+
+    MINIMUM = "minimum"
+    STANDARD = "standard"
+    AGGRESSIVE = "aggressive"
+
+
+@dataclass(frozen=True)
+class DcamOptions:
+    """Options of a `DcamCamera`.
+
+    trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of
+    the set exposure. With LEVEL or SYNC_READOUT the pulses set the exposure. The exposure in CameraSettings must still
+    equal their length (or distance), since the time of the first frame of a run is computed from it.
+
+    Raises:
+        ValueError: a number outside its range.
+    """
+
+    trigger_active: TriggerActive = key(
+        TriggerActive.EDGE,
+        "edge: a pulse begins an exposure of exposure_s. level: the pulse's length is the exposure; set exposure_s to "
+        "it. sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan "
+        "takes.",
+    )
+    trigger_mode: TriggerMode = key(
+        TriggerMode.NORMAL, "start: the first pulse begins a free run, which no fly scan takes."
+    )
+    trigger_polarity: TriggerPolarity = key(
+        TriggerPolarity.POSITIVE,
+        "The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here.",
+    )
+    trigger_times: int = key(1, "Every so many pulses make one frame; a fly scan takes 1.", ge=1, le=10_000)
+    trigger_delay: float = key(
+        0.0, "From a pulse to the exposure; the angle in the file stays that of the pulse.", unit="s", ge=0, le=10
+    )
+    global_exposure: GlobalExposure = key(
+        GlobalExposure.DELAYED,
+        "delayed: rolling shutter. global_reset: all rows begin at once, later rows expose longer unless light is cut.",
+    )
+    hot_pixels: HotPixelMode | None = key(
+        None,
+        "null: counts as measured; else the camera repairs defects with this sensitivity, which alters data.",
+    )
+    exposure_tolerance: float = key(
+        0.01, "By which fraction (and one line time) the camera may change an exposure before it is refused.", ge=0
+    )
+    ring: int = key(1000, "Most memory for the ring; a full frame has 18.9 MB.", unit=MEGABYTES, gt=0, le=1_000_000)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.trigger_times <= 10_000:
+            raise ValueError(f"trigger_times must be 1 to 10000, not {self.trigger_times}")
+        if not 0 <= self.trigger_delay <= 10:  # also refuses NaN
+            raise ValueError(f"trigger_delay must be 0 to 10 s, not {self.trigger_delay}")
+        if not (math.isfinite(self.exposure_tolerance) and self.exposure_tolerance >= 0):
+            raise ValueError(f"exposure_tolerance is a fraction of 0 or more, not {self.exposure_tolerance}")
+        if self.ring < 1:
+            raise ValueError(f"ring must be positive, not {self.ring}")

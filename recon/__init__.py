@@ -1,4 +1,4 @@
-"""Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `find_axis`, `remove_rings`, `reconstruct`.
+"""Tomographic reconstruction of splatline, arrays in, arrays out: `recon.correct`, `find_axis`, `reconstruct`.
 
 The values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and numba on
 first use: a program that only plans a scan starts quickly.
@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Energies, Progress, Reconstruction, RunControl
 from recon.base.ray_width import RayWidth
+from recon.base.vectors import geometry_of_vectors, vectors_of
 from recon.base.volume import Grid, Volume
 from recon.compiled import use_compiled_kernels
 from recon.methods import REGISTRY
@@ -26,39 +27,41 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
     from recon.auto import Auto
-    from recon.axis_by_views import axis_by_views
-    from recon.energy_fit import EnergyViews
-    from recon.fields.methods import NAF, IntraTomo, SaxNerf
-    from recon.joint_methods import EnergySeries, TimeSeries
+    from recon.axis_held_out import axis_by_views
+    from recon.features.emission.likelihood import attenuation_factors, mlem
+    from recon.features.emission.methods import Mlem, Osem
+    from recon.features.iterative.asd_pocs import AsdPocs as AsdPocs
+    from recon.features.iterative.cgls import Cgls as Cgls
+    from recon.features.iterative.sart import Sart as Sart
+    from recon.features.iterative.sirt import Sirt as Sirt
+    from recon.features.joint.energy_fit import EnergyViews
+    from recon.features.joint.methods import EnergySeries, TimeSeries
+    from recon.features.joint.registration import register_energies
+    from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
+    from recon.features.joint.share_fit import fit_share
+    from recon.features.joint.spectral import Materials, fit_materials
+    from recon.features.neural.methods import NAF as NAF
+    from recon.features.neural.methods import IntraTomo as IntraTomo
+    from recon.features.neural.methods import SaxNerf as SaxNerf
+    from recon.features.published.r2_published import R2Published as R2Published
+    from recon.features.rings.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
-    from recon.prep.rings import WithoutRings, remove_rings
+    from recon.prep.emission import Emission, weighted_lines
     from recon.reconstruction import reconstruct
-    from recon.registration import register_energies
-    from recon.series import TimedViews, TimedVolumes, fit_series
-    from recon.share_fit import fit_share
-    from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
-    from recon.splatting.published import R2Published
     from recon.splatting.r2 import R2
     from recon.splatting.settings import FitSettings
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
-    from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
-    from recon.voxels.methods.asd_pocs import AsdPocs
-    from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
-    from recon.voxels.methods.mlem import Mlem, Osem
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
     from recon.voxels.methods.pnp_dct import PnpDct
-    from recon.voxels.methods.sart import Sart
-    from recon.voxels.methods.sirt import Sirt
     from recon.voxels.projector import Projector
 
 __all__ = [
-    "NAF",
     "R2",
     "AsdPocs",
     "Auto",
@@ -77,7 +80,6 @@ __all__ = [
     "Gaussians",
     "Geometry",
     "Grid",
-    "IntraTomo",
     "Kernel",
     "Materials",
     "Mlem",
@@ -87,13 +89,11 @@ __all__ = [
     "Progress",
     "Projections",
     "Projector",
-    "R2Published",
     "RayWidth",
     "Reconstruction",
     "References",
     "RunControl",
     "Sart",
-    "SaxNerf",
     "Sirt",
     "StreamingFit",
     "TimeSeries",
@@ -108,11 +108,13 @@ __all__ = [
     "fit_materials",
     "fit_series",
     "fit_share",
+    "geometry_of_vectors",
     "mlem",
     "project",
     "reconstruct",
     "register_energies",
     "remove_rings",
+    "vectors_of",
     "voxelize",
     "weighted_lines",
 ]
@@ -120,20 +122,21 @@ __all__ = [
 _LAZY = {
     "Auto": "recon.auto",
     "AxisEstimate": "recon.prep.align",
-    "axis_by_views": "recon.axis_by_views",
+    "axis_by_views": "recon.axis_held_out",
     "find_axis": "recon.prep.align",
     **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",
-    **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
+    **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings.rings"),
     "reconstruct": "recon.reconstruction",
-    "register_energies": "recon.registration",
-    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
-    "EnergyViews": "recon.energy_fit",
-    **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
-    "fit_share": "recon.share_fit",
+    "register_energies": "recon.features.joint.registration",
+    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.features.joint.series"),
+    "EnergyViews": "recon.features.joint.energy_fit",
+    **dict.fromkeys(("Materials", "fit_materials"), "recon.features.joint.spectral"),
+    "fit_share": "recon.features.joint.share_fit",
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
-    **dict.fromkeys(("Emission", "attenuation_factors", "mlem", "weighted_lines"), "recon.voxels.emission"),
+    **dict.fromkeys(("Emission", "weighted_lines"), "recon.prep.emission"),
+    **dict.fromkeys(("attenuation_factors", "mlem"), "recon.features.emission.likelihood"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),
@@ -148,4 +151,8 @@ def __dir__() -> list[str]:
 def __getattr__(name: str) -> Any:
     if name in _LAZY:
         return getattr(import_module(_LAZY[name]), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("splatline")
     raise AttributeError(f"module 'recon' has no attribute {name!r}")

@@ -12,6 +12,7 @@ from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import ChoosingMethod, Method, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod, Costs, Work
 from recon.splatting.finish import Candidates
@@ -51,6 +52,11 @@ class Auto:
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
+    def __post_init__(self) -> None:
+        check_settings(self)
+        if not self.candidates:
+            raise ValueError("candidates must be at least one method, got none")
+
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
 
@@ -72,6 +78,9 @@ class Auto:
 
         Methods that views held out judge in one trial, as `r2` does, are not run for it. `decide` takes its prior.
         """
+        data = problem.projections
+        if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
+            raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
         last = len(self.candidates) - 1
         fit = self._fit
         if fit is not None:

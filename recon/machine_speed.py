@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +17,12 @@ import numpy as np
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Clock
+from recon.base.registry import in_folders
 from recon.base.volume import Grid, Volume
 from recon.base.work import Rate
-from recon.energy_fit import EnergyFit, EnergyViews
-from recon.fields.train import FieldMethod
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.patches import denoise, patch_scratch
 from recon.kernels.cpu.vectors import add_product
-from recon.methods import by_name, with_settings
-from recon.reconstruction import reconstruct
-from recon.series import MOMENTS, TimedViews, of_moments
 from recon.splatting import optimise
 from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians
@@ -34,17 +31,16 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
 from recon.splatting.work import covered
 from recon.voxels.direct import direct, direct_work
-from recon.voxels.motion import Motion
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import Sweeps
 from recon.voxels.tv import TotalVariationProx
 
 _TV_STEPS = 3
 _SERIAL = ("draw",)  # operations of one thread
-_RUNS = 3  # the quickest counts; one more comes first, and loads the code and the data
+RUNS = 3  # the quickest counts; one more comes first, and loads the code and the data
 
 
-class _Timed(NamedTuple):
+class SizedRun(NamedTuple):
     """An operation of some size: the two amounts of its work, and what does it."""
 
     first: float
@@ -64,17 +60,17 @@ def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:
         KeyError: there is no such operation.
     """
     kind, _, which = operation.partition(", ")
-    rate = _rate(OPERATIONS[kind](which), now)
+    rate = rate_of(OPERATIONS[kind](which), now)
     return rate if kind in _SERIAL else Rate(rate.first / threads, rate.second / threads)
 
 
-def _rate(timed: tuple[_Timed, ...], now: Clock) -> Rate:
+def rate_of(timed: tuple[SizedRun, ...], now: Clock) -> Rate:
     """By two sizes with rates of 0 or more: where one would be less, or of one size, the larger tells the other."""
     seconds = []
     for size in timed:
         size.run()
         times = []
-        for _ in range(_RUNS):
+        for _ in range(RUNS):
             begin = now()
             size.run()
             times.append(now() - begin)
@@ -95,13 +91,13 @@ def _geometry(beam: str, rows: int, cols: int, views: int) -> Geometry:
     return Geometry.parallel(angles, (rows, cols), tilt=0.05 if beam == "posed" else 0.0)
 
 
-def _sweeps(beam: str, single: bool = False) -> tuple[_Timed, ...]:
+def _sweeps(beam: str, single: bool = False) -> tuple[SizedRun, ...]:
     several = ((2, 256), (64, 192)) if single else ((8, 160), (96, 192))
     sizes = ((1, 96), (1, 512)) if beam == "slice" else several
     return tuple(_swept(beam, *size, single) for size in sizes)
 
 
-def _swept(beam: str, rows: int, cols: int, single: bool) -> _Timed:
+def _swept(beam: str, rows: int, cols: int, single: bool) -> SizedRun:
     """Lines and voxels of a few views, together or one by one."""
     geometry = _geometry(beam, rows, cols, 4 if single or beam == "posed" else 16)
     grid = Grid.matching(geometry)
@@ -109,15 +105,15 @@ def _swept(beam: str, rows: int, cols: int, single: bool) -> _Timed:
     projector, x = Projector(geometry, grid), np.ones((ny, nx, nz), np.float32)
     lines = float(geometry.n_views * ny * nx)
     if not single:
-        return _Timed(lines, lines * nz, lambda: projector.adjoint_lines(projector.forward_lines(x), x))
+        return SizedRun(lines, lines * nz, lambda: projector.adjoint_lines(projector.forward_lines(x), x))
     sweeps = Sweeps(projector, projector.forward_lines(x), None, list(np.arange(geometry.n_views)[:, None]))
-    return _Timed(lines, lines * nz, lambda: sweeps.run(x, 1.0, True, None))
+    return SizedRun(lines, lines * nz, lambda: sweeps.run(x, 1.0, True, None))
 
 
-def _on_volume(make: Callable[[tuple[int, int, int]], Callable[[], object]], times: int = 1) -> tuple[_Timed, ...]:
+def _on_volume(make: Callable[[tuple[int, int, int]], Callable[[], object]], times: int = 1) -> tuple[SizedRun, ...]:
     """Lines and voxels of a volume that is passed so many times."""
     return tuple(
-        _Timed(float(times * a * b), float(times * a * b * c), make((a, b, c)))
+        SizedRun(float(times * a * b), float(times * a * b * c), make((a, b, c)))
         for a, b, c in ((160, 160, 8), (192, 192, 96))
     )
 
@@ -152,24 +148,24 @@ _FBP = {  # rows, columns and views for which FBP takes either way
 }
 
 
-def _filtered(which: str) -> tuple[_Timed, ...]:
+def _filtered(which: str) -> tuple[SizedRun, ...]:
     return tuple(
-        _Timed(*direct_work(geometry, grid).amounts[f"fbp, {which}"], partial(direct, data, geometry, grid, "hann"))
-        for geometry, grid, data in (_lines("parallel", *size) for size in _FBP[which])
+        SizedRun(*direct_work(geometry, grid).amounts[f"fbp, {which}"], partial(direct, data, geometry, grid, "hann"))
+        for geometry, grid, data in (views_of_disc("parallel", *size) for size in _FBP[which])
     )
 
 
-def _back_projected(which: str) -> tuple[_Timed, ...]:
+def _back_projected(which: str) -> tuple[SizedRun, ...]:
     return tuple(
-        _Timed(
+        SizedRun(
             *direct_work(geometry, grid).amounts[f"back-projection, {which}"],
             partial(direct, data, geometry, grid, "hann"),
         )
-        for geometry, grid, data in (_lines(which, rows, cols, 12) for rows, cols in ((8, 96), (32, 128)))
+        for geometry, grid, data in (views_of_disc(which, rows, cols, 12) for rows, cols in ((8, 96), (32, 128)))
     )
 
 
-def _lines(beam: str, rows: int, cols: int, views: int) -> tuple[Geometry, Grid, F32]:
+def views_of_disc(beam: str, rows: int, cols: int, views: int) -> tuple[Geometry, Grid, F32]:
     """Views of a disc with a hole, and the grid that matches them."""
     geometry = _geometry(beam, rows, cols, views)
     grid = Grid.matching(geometry)
@@ -179,13 +175,13 @@ def _lines(beam: str, rows: int, cols: int, views: int) -> tuple[Geometry, Grid,
     return geometry, grid, Projector(geometry, grid).forward((disc / width).astype(np.float32))
 
 
-def _fitted(beam: str) -> tuple[_Timed, ...]:
+def _fitted(beam: str) -> tuple[SizedRun, ...]:
     return _steps(beam, 16, 96), _steps(beam, 48, 128)
 
 
-def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> _Timed:
+def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> SizedRun:
     """Views of some steps of a fit, and what its Gaussians cover in them."""
-    geometry, grid, data = _lines(beam, rows, cols, 12)
+    geometry, grid, data = views_of_disc(beam, rows, cols, 12)
     settings = FitSettings(policy=None)
     gaussians = _drawn(geometry, grid)
     state = optimise.init(gaussians, 0)
@@ -196,16 +192,16 @@ def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> _Timed:
         for _ in range(steps):
             optimise.step(state, problem, settings, 0.0)
 
-    return _Timed(views, views * covered(math.prod(grid.shape), gaussians.n), run)
+    return SizedRun(views, views * covered(math.prod(grid.shape), gaussians.n), run)
 
 
-def _normalised(which: str) -> tuple[_Timed, ...]:
+def _normalised(which: str) -> tuple[SizedRun, ...]:
     return _made_problem(16, 96), _made_problem(64, 160)
 
 
-def _made_problem(rows: int, cols: int) -> _Timed:
-    geometry, grid, data = _lines("parallel", rows, cols, 12)
-    return _Timed(
+def _made_problem(rows: int, cols: int) -> SizedRun:
+    geometry, grid, data = views_of_disc("parallel", rows, cols, 12)
+    return SizedRun(
         geometry.n_views,
         data.size,
         lambda: optimise.problem_of(data, geometry, grid, 1.0, FitSettings(), backend_for("cpu")),
@@ -226,69 +222,32 @@ def _drawn(geometry: Geometry, grid: Grid) -> Gaussians:
     )  # fmt: skip
 
 
-def _draws(which: str) -> tuple[_Timed, ...]:
+def _draws(which: str) -> tuple[SizedRun, ...]:
     return _draw(8, 64), _draw(32, 128)
 
 
-def _draw(rows: int, cols: int) -> _Timed:
+def _draw(rows: int, cols: int) -> SizedRun:
     grid = Grid((rows, cols, cols))
     geometry = _geometry("parallel", rows, cols, 12)
-    return _Timed(count_for(grid, False), math.prod(grid.shape), partial(_drawn, geometry, grid))
+    return SizedRun(count_for(grid, False), math.prod(grid.shape), partial(_drawn, geometry, grid))
 
 
-def _fills(which: str) -> tuple[_Timed, ...]:
+def _fills(which: str) -> tuple[SizedRun, ...]:
     return _fill(8, 64), _fill(32, 128)
 
 
-def _fill(rows: int, cols: int) -> _Timed:
+def _fill(rows: int, cols: int) -> SizedRun:
     grid = Grid((rows, cols, cols))
     gaussians = _drawn(_geometry("parallel", rows, cols, 12), grid)
-    return _Timed(gaussians.n, math.prod(grid.shape), partial(voxelize, gaussians, grid))
+    return SizedRun(gaussians.n, math.prod(grid.shape), partial(voxelize, gaussians, grid))
 
 
-def _fields(which: str) -> tuple[_Timed, ...]:
-    geometry, grid, data = _lines("parallel", 8, 64, 24)
-    method = by_name(which)()
-    assert isinstance(method, FieldMethod)
-    samples, voxels = method.rays * method.samples_of(64), math.prod(grid.shape)
-
-    def run(steps: int) -> object:
-        return reconstruct(data, geometry, with_settings(method, {"steps": steps}))
-
-    return tuple(_Timed(steps * samples, voxels, partial(run, steps)) for steps in (1, 4))
+def _of_feature(module: str, which: str) -> tuple[SizedRun, ...]:
+    timed: tuple[SizedRun, ...] = import_module(module).timed(which)
+    return timed
 
 
-def _series(which: str) -> tuple[_Timed, ...]:
-    how, volumes = which.split()
-    if how == "energies":
-        return _by_energy(int(volumes), 32), _by_energy(int(volumes), 80)
-    return _serial(int(volumes), how == "moving", 32), _serial(int(volumes), how == "moving", 80)
-
-
-def _by_energy(materials: int, cols: int) -> _Timed:
-    """Views, and voxels x views, of sweeps of a fit of materials at as many energies."""
-    geometry, _, data = _lines("parallel", 16, cols, 12 * materials)
-    energies = np.arange(geometry.n_views) * materials // geometry.n_views
-    views = EnergyViews(data, geometry, energies, np.eye(materials) + 0.5)
-    return _timed_sweeps(EnergyFit(views, Grid.matching(geometry), np.random.default_rng(0)), materials)
-
-
-def _serial(knots: int, moves: bool, cols: int) -> _Timed:
-    """Views, and voxels x views, of sweeps of a fit of volumes in time."""
-    geometry, _, data = _lines("parallel", 16, cols, 12 * knots)
-    grid, times = Grid.matching(geometry), np.arange(geometry.n_views, dtype=np.float64)
-    views, past = of_moments(TimedViews(data, geometry, times), np.linspace(0, times[-1], knots), MOMENTS * (knots - 1))
-    nz, ny, nx = grid.shape
-    fit = EnergyFit(views, grid, np.random.default_rng(0), Motion.none((ny, nx, nz), past, 3, 3) if moves else None)
-    return _timed_sweeps(fit, knots)
-
-
-def _timed_sweeps(fit: EnergyFit, volumes: int) -> _Timed:
-    n = float(fit.views.geometry.n_views)
-    return _Timed(n, n * math.prod(fit.grid.shape), lambda: list(fit.sweeps(np.full(volumes, 0.1), 1)))
-
-
-OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
+OPERATIONS: Mapping[str, Callable[[str], tuple[SizedRun, ...]]] = {
     "sweep": _sweeps,  # a projection and its adjoint: lines x views, voxels x views; of a kind of beam
     "single sweep": partial(_sweeps, single=True),  # the same, with a correction of the volume after each view
     "pass": lambda which: _on_volume(_passed),  # sums of volumes: lines, voxels
@@ -303,6 +262,6 @@ OPERATIONS: Mapping[str, Callable[[str], tuple[_Timed, ...]]] = {
     "view": _fitted,  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
     "draw": _draws,  # first Gaussians: Gaussians, voxels
     "fill": _fills,  # the volume of Gaussians: Gaussians, voxels
-    "series": _series,  # sweeps of several volumes: views, voxels x views; at rest, moving or of energies, and volumes
-    "field": _fields,  # steps of a neural field: samples, voxels of its volume; of a method
+    **{kind: partial(_of_feature, module) for kind, module in in_folders("recon.features", "OPERATIONS").items()},
 }
+"""By name, with those of features: the folder of one names for each a module, whose `timed` makes them."""

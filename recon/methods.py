@@ -1,4 +1,4 @@
-"""The registry of reconstruction methods: one line a method. Adding one takes its file and its line here.
+"""The registry of reconstruction methods: one line a method, here or in the folder of its feature.
 
 A line says where the method's class is, so that its name is known without loading its libraries.
 """
@@ -6,58 +6,28 @@ A line says where the method's class is, so that its name is known without loadi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any
 
 from recon.base.choices import AUTO
 from recon.base.method import Method
-from recon.base.registry import Registry
-
-
-@dataclass(frozen=True)
-class MethodEntry:
-    """Where a method is.
-
-    Attributes:
-        module, cls: of its settings class, see `recon.base.method.Method`.
-        streams: it has `stream`, so that its volume can grow while views arrive.
-        compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
-        emission: it is compared where the sample emits, whatever `compared` says.
-        several: what its volumes are of, where it makes several.
-    """
-
-    module: str
-    cls: str
-    streams: bool = False
-    compared: bool = True
-    emission: bool = False
-    several: Literal["", "times", "materials"] = ""
-
+from recon.base.method_entry import MethodEntry
+from recon.base.registry import Registry, in_folders, unknown
 
 REGISTRY: dict[str, MethodEntry] = {
     "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
-    "r2-published": MethodEntry("recon.splatting.published", "R2Published", streams=True, compared=False),
     "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
-    "sirt": MethodEntry("recon.voxels.methods.sirt", "Sirt"),
-    "sart": MethodEntry("recon.voxels.methods.sart", "Sart"),
-    "cgls": MethodEntry("recon.voxels.methods.cgls", "Cgls"),
-    "mlem": MethodEntry("recon.voxels.methods.mlem", "Mlem", compared=False, emission=True),
-    "osem": MethodEntry("recon.voxels.methods.mlem", "Osem", compared=False, emission=True),
-    "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
     "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
-    "series": MethodEntry("recon.joint_methods", "TimeSeries", compared=False, several="times"),
-    "materials": MethodEntry("recon.joint_methods", "EnergySeries", compared=False, several="materials"),
-    "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
-    "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
-    "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),
+    **in_folders("recon.features", "METHODS"),
 }
 
 DEFAULT = "r2"  # The default method
 
-IN_TIME = "series"  # The method of volumes in time
+IN_TIME = next((name for name, entry in REGISTRY.items() if entry.several == "times"), None)
+"""The method of volumes in time; None: this installation has none."""
 
 BASELINE = "fbp"  # Reports compare all methods with this one
 
@@ -130,6 +100,15 @@ def has_setting(method: type[Method], field: str) -> bool:
     return value is not None and last in {f.name for f in fields(value)}
 
 
+def setting_names(method: Any) -> list[str]:
+    """Names of all settings of a method, by path as in `taking`."""
+    names = []
+    for each in fields(method):
+        value = getattr(method, each.name)
+        names += [f"{each.name}.{inner}" for inner in setting_names(value)] if is_dataclass(value) else [each.name]
+    return names
+
+
 def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
     """A method with these settings, by name as in `taking`; other settings have their defaults.
 
@@ -138,7 +117,8 @@ def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
     """
     for name in settings:
         if not has_setting(method, name):
-            owners = ", ".join(taking(name)) or "no method"
+            if not (owners := ", ".join(taking(name))):
+                raise ValueError(unknown(f"setting of {method.name}", name, setting_names(method())))
             raise ValueError(f"method {method.name!r} has no setting {name!r} ({owners} has)")
     found: Method = with_settings(method(), settings)
     return found

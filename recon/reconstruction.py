@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.method import Reconstruction as Reconstruction
@@ -17,7 +18,7 @@ from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
-from recon.voxels.emission import Emission, weighted_lines
+from recon.prep.emission import Emission, weighted_lines
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,19 +53,19 @@ def reconstruct(
         control: how to watch, end and continue the reconstruction.
 
     Raises:
-        ValueError: for an unknown method, shapes that disagree, views from one side only, or data without matter. Also
-        for an argument that the method does not take: views held out, a device, checkpoints, or these views.
+        ValueError: for an unknown method, shapes that disagree, views from one side only, data without matter, or a
+        negative seed. Also for an argument that the method does not take: views held out, a device, checkpoints, or
+        these views.
 
     Warns:
         UserWarning: angles look like degrees, projections like counts or transmission, or, for a method that keeps no
             voxel below 0, like line integrals of the other sign. The reconstruction goes on.
     """
-    if isinstance(method, type):
-        raise ValueError(
-            f"method is the class {method.__name__}; give a name or an object, such as {method.__name__}()"
-        )
+    check_arguments(reconstruct, locals())
     chosen = by_name(method)() if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
+    if seed < 0:
+        raise ValueError(f"seed must be a whole number of 0 or more, got {seed}")
     _refuse_foreign(chosen, device, use, control)
     _refuse_one_side(geometry)
     if isinstance(projections, Counts | Emission):
@@ -78,9 +79,10 @@ def reconstruct(
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     begin = control.now()
-    result = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
+    result = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, int(seed), device), control)
     settings = MappingProxyType(dict(result.settings))
-    return replace(result, settings=settings, method=result.method or chosen.name, seconds=control.now() - begin)
+    seconds = result.seconds or control.now() - begin
+    return replace(result, settings=settings, method=result.method or chosen.name, seconds=seconds)
 
 
 def _warn_of_negative(data: NDArray[np.float32]) -> None:

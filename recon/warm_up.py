@@ -157,7 +157,7 @@ def _views_like(geometry: Geometry | None) -> Geometry:
         angles = np.linspace(0, turn, _VIEWS, endpoint=False)
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
-        leaning = (geometry.roll != 0) | (geometry.tilt != 0)
+        leaning = (geometry.roll != 0) | (geometry.tilt != 0) | geometry.centres.any(axis=1)
         # If only some views lean, the same holds here.
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))

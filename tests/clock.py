@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 
 @dataclass
 class SteppedClock:
-    """Time (s) that passes when somebody sleeps, and by a tick with each look at it.
+    """Time (s) that passes when somebody sleeps, and by a tick with each look at it; what is `due` by then happens.
 
     It is a `drivers.base.clock.Clock`, and is called as `time.perf_counter` is.
     """
 
     time: float = 0.0
     tick: float = 0.0
+    due: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
 
     def now(self) -> float:
-        self.time += self.tick
+        self._pass(self.tick)
         return self.time
 
     def sleep(self, seconds: float) -> None:
+        self._pass(seconds)
+
+    def _pass(self, seconds: float) -> None:
         self.time += seconds
+        while self.due and self.due[0][0] <= self.time:
+            self.due.pop(0)[1]()
 
     __call__ = now

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -15,10 +16,14 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-import recon  # noqa: F401 - before numba: it says what processor numba compiles for
+from recon.compiled import ROOT  # before numba: it says what processor numba compiles for
 
 # isort: split
 import numba
+
+from recon.compiled.archive import archive_of, fresh_members, read_sources
+from recon.compiled.level import LEVELS, level_for, processor_flags
+from tests.features import folders, table
 
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
 # No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
@@ -42,6 +47,11 @@ os.environ["XDG_STATE_HOME"] = os.environ["LOCALAPPDATA"] = _STATE.name
 def pytest_configure(config: pytest.Config) -> None:
     """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work, and
     threads of OpenBLAS burn the time of a core while they wait."""
+    config.addinivalue_line("markers", "feature: of a feature's folder, see [tool.splatline.features]")
+    # `pytest` alone runs the core's tests; a path, or another -m, runs what it names. The environment tells workers.
+    if not hasattr(config, "workerinput"):
+        alone = config.args_source is pytest.Config.ArgsSource.TESTPATHS and "not slow" in config.option.markexpr
+        os.environ["SPLATLINE_CORE_ONLY"] = "1" if alone else ""
     if getattr(config.option, "numprocesses", None):
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # workers, which begin later, and their processes have it
     if hasattr(config, "workerinput"):
@@ -49,6 +59,22 @@ def pytest_configure(config: pytest.Config) -> None:
         import torch  # here, as tests without it start in half the time
 
         torch.set_num_threads(1)
+
+
+_FEATURES = {folder for feature in table() for folder in folders(feature)}
+
+
+@cache
+def _is_of_a_feature(path: Path) -> bool:
+    return not _FEATURES.isdisjoint(path.parents)
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of features, which mirror their folders."""
+    for item in items:
+        if _is_of_a_feature(item.path):
+            item.add_marker("feature")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -64,10 +90,23 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return LoadFileScheduling(config, log) if by_file else None
 
 
+def _kernels_are_carried() -> bool:
+    """All of these sources, compiled for this processor: nothing is left to compile."""
+    archive = archive_of(sys.version_info[:2])
+    if (
+        "NUMBA_CACHE_DIR" in os.environ
+        or not archive.is_file()
+        or level_for(os.environ, processor_flags()) not in LEVELS
+    ):
+        return False
+    return set(read_sources(archive)) == set(fresh_members(archive, ROOT))
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Before workers run the whole suite: kernels are compiled once, not by each of them (see compile_kernels)."""
     config = session.config
-    if getattr(config.option, "numprocesses", None) and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    if getattr(config.option, "numprocesses", None) and whole and not _kernels_are_carried():
         halves = [
             subprocess.Popen(
                 [sys.executable, "-m", "tests.compile_kernels", half], cwd=config.rootpath, stdout=subprocess.DEVNULL
@@ -82,13 +121,19 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Of the whole suite, files without a test of the kind that is asked for are not imported, as most of the time of
-    collecting is imports: measurements, and, where slow tests are asked for, files that name none."""
+    collecting is imports: measurements; features, where only the core is tested; files that name no slow test, where
+    these and features are asked for."""
     if [Path(argument).name for argument in config.args] != ["tests"]:
         return None
     asked = config.option.markexpr
     if "not bench" in asked and collection_path == Path(__file__).parent / "bench":
         return True
-    if not asked.startswith("slow") or collection_path.suffix != ".py":
+    if collection_path.suffix != ".py":
+        return None
+    of_a_feature = _is_of_a_feature(collection_path)
+    if not asked.startswith(("slow", "(slow")):
+        return True if of_a_feature and os.environ["SPLATLINE_CORE_ONLY"] else None
+    if of_a_feature and "slow or feature" in asked:
         return None
     text = collection_path.read_text(encoding="utf-8")
     return None if "slow" in text or "Conformance" in text else True  # a conformance suite has slow tests of its own
@@ -103,7 +148,6 @@ def pytest_collection(session: pytest.Session) -> None:
 
 def pytest_collection_finish() -> None:
     """What is loaded now lives to the end: the garbage collector need not look through it time and again."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 

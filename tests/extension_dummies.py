@@ -63,11 +63,11 @@ import numpy as np
 import recon
 from click.testing import CliRunner
 from beamline.cli.recon import recon as command
-from beamline.cli.tradeoff import tradeoff
+from beamline.features.trials.tradeoff_command import tradeoff
 from beamline.reconstruct.option_rules import RULES, takers
 from beamline.reconstruct.outcome import label_of
-from beamline.trials.figures import pareto_plot
-from beamline.trials.plans import plan
+from beamline.features.trials.figures import pareto_plot
+from beamline.features.trials.plans import plan
 from recon import methods
 
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))
@@ -123,7 +123,7 @@ from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.scan import recorder
 from beamline.scan.run import run_scan
-from beamline.storage.describe import describe
+from beamline.features.files.describe import describe
 import h5py
 from pathlib import Path
 
@@ -232,7 +232,7 @@ FORMAT = ScanFormat("an .npy stack", lambda path, opening: path.suffix == ".npy"
     ),
     """
 import numpy as np
-from beamline.storage.describe import describe
+from beamline.features.files.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
 
 data = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
@@ -246,7 +246,7 @@ assert describe("scan.npy")["format"] == "npy_stack"
 
 STAGE = Extension(
     {
-        "drivers/stages/turn/__init__.py": '"""A dummy controller, which answers with its counts."""\n',
+        "drivers/stages/turn/__init__.py": '"""A dummy stage."""\n\nDRIVERS = {"turn": "TurnStage"}\n',
         "drivers/stages/turn/stage.py": '''
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -283,7 +283,7 @@ class TurnStage:
     def close(self):
         self._line.close()
 ''',
-        "simulators/wires/turn/__init__.py": '"""The dummy controller."""\n',
+        "simulators/wires/turn/__init__.py": '"""The dummy controller."""\n\nCONTROLLERS = {"turn": "TurnBuild"}\n',
         "simulators/wires/turn/wire.py": """
 from dataclasses import dataclass
 
@@ -315,10 +315,7 @@ class TurnBuild:
         return TurnController(clock, self.counts)
 """,
     },
-    (
-        ("drivers/stages/registry.py", '    "zaber": "ZaberStage",', '    "turn": "TurnStage",'),
-        ("simulators/wires/registry.py", '    "zaber": "ZaberBuild",', '    "turn": "TurnBuild",'),
-    ),
+    (),
     """
 import math
 from beamline.config.load import config_folder, load
@@ -378,7 +375,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/registry.py", '    "Hardening": "hardening",', '    "Lift": "lift",'),),
+    (("beamline/projections/registry.py", '    "Rings": "rings",', '    "Lift": "lift",'),),
     """
 from pathlib import Path
 

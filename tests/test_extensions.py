@@ -46,14 +46,15 @@ def test_an_extension_is_its_own_files_and_one_line_of_each_registry(tmp_path: P
             path = tmp_path / name
             path.parent.mkdir(exist_ok=True)
             path.write_text(text, encoding="utf-8")
-    assert _failed(tmp_path).keys() == EXTENSIONS.keys()  # nobody knows them yet
-    for kind, extension in EXTENSIONS.items():
+    by_line = {kind for kind, extension in EXTENSIONS.items() if extension.lines}
+    assert _failed(tmp_path).keys() == by_line == EXTENSIONS.keys() - {"stage"}  # a stage enters by its folders
+    for extension in EXTENSIONS.values():
         for name, above, line in extension.lines:
             path = tmp_path / name
             text = path.read_text(encoding="utf-8")
             assert text.count(above + "\n") == 1, f"{name} has no line {above!r}"
             path.write_text(text.replace(above + "\n", f"{above}\n{line}\n"), encoding="utf-8")
-        assert len(extension.lines) == (2 if kind == "stage" else 1)  # a stage: its driver's, its simulated wire's
+        assert len(extension.lines) <= 1
         assert all("\n" not in line for *_, line in extension.lines)
     assert not (failed := _failed(tmp_path)), "\n".join(failed.values())
 

@@ -8,7 +8,7 @@ import grimp
 import pytest
 
 PACKAGES = ("beamline", "recon", "drivers", "simulators")
-JUMPS = "beamline.projections.corrections.jumps"
+JUMPS = "beamline.projections.corrections.jumps.jumps"
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from beamline.config.load import Config, changed, load, override_of
 from beamline.config.monochromator import NoMonochromator
-from beamline.core.errors import ConfigError, ScanStopped
+from beamline.core.errors import ConfigError, ScanStopped, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
 from beamline.core.run_result import RunResult
@@ -97,6 +97,7 @@ class Instrument:
             In all these cases the acquired frames are in the file: see `last`. A scan that ends because its views were
             enough (`recon.stop_when`) does not raise.
         """
+        refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
             raise ConfigError("a scan of this instrument still runs: wait for its end. Nothing was started.")
         try:
@@ -170,6 +171,7 @@ def connect(
         ConfigError: every fault with file, line, key and legal values.
         DeviceError: a device does not answer; those opened before it are closed again.
     """
+    refuse_wrong_arguments(connect, locals())
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
     return Instrument(read, devices.connect(read, ask=ask), say)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
-from beamline.core.errors import DataError
+from beamline.core.errors import DataError, refuse_wrong_arguments
 from beamline.core.files import parts_of
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
@@ -48,6 +48,7 @@ def monitor(
     Raises:
         ConfigError: `config` is wrong. DataError: no scan, or one that died.
     """
+    refuse_wrong_arguments(monitor, locals())
     checks, limits = CHECKS, None
     if config is not None:
         read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
@@ -69,6 +70,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     Raises:
         DataError: no scan, none that begins within 120 s, or one that died.
     """
+    refuse_wrong_arguments(stream, locals())
     path = Path(path)
     place = parts_of(path)[-1] / SCAN if path.is_dir() and not (path / JOINED).is_file() else scan_file(path)
     with _opened(place, follow) as source:
@@ -85,6 +87,7 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     Raises:
         DataError: no folder of a run.
     """
+    refuse_wrong_arguments(volumes, locals())
     folder, shown = Path(run), None
     watch = watched(folder)
     while True:

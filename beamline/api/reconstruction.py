@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from beamline.api.instrument import Say, to_stderr
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
 from beamline.core.stop import StopOnSignal
+from beamline.energies.scans import EnergyScans
+from beamline.energies.spectra import read_spectra
 from beamline.projections.selection import Selection
-from beamline.reconstruct.energy_scans import EnergyScans, read_spectra
-from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.energies import scans_of
 from beamline.storage.interrupted import scan_file
 from beamline.storage.readers.open import SourceOptions
@@ -29,8 +28,7 @@ from drivers.base.clock import SystemClock
 from recon.auto import Auto
 from recon.base.choices import AUTO
 from recon.base.method import Method, volume_names_of
-from recon.base.volume import Volume
-from recon.joint_methods import EnergySeries
+from recon.features.joint.methods import EnergySeries
 from recon.methods import by_name
 
 ReconResult = ReconRecord  # what scripts get
@@ -47,6 +45,7 @@ def energy_scans(paths: Sequence[str | Path], spectra: str | Path, *, registered
     Raises:
         DataError: the table cannot be read, or there is no scan.
     """
+    refuse_wrong_arguments(energy_scans, locals())
     scans = scans_of([Path(path) for path in paths], lambda sentence: None)
     if not scans:
         raise DataError("There is no scan among these paths; expected one at each energy.")
@@ -86,36 +85,25 @@ def reconstruct(
         ConfigError: an impossible method or selection. DataError: no scan, data that give no volume, or an output
         that exists or cannot be written. Nothing is written then.
     """
-    source = path if isinstance(path, EnergyScans) else SourceOptions(scan_file(path))
+    refuse_wrong_arguments(reconstruct, locals())
+    source = path if isinstance(path, EnergyScans) else SourceOptions(scan_file(path), frames_per_view=None)
     chosen = EnergySeries(source.spectra.names) if method == AUTO and path is source else _method(method)
-    made: list[ReconRecord] = []
-    held: list[Volume] = []
 
     def sink(event: Event) -> None:
-        if isinstance(event, VolumeDone):
-            made.append(event.record)
-        elif say is not None and (text := sentence(event)):
+        if say is not None and not isinstance(event, VolumeDone) and (text := sentence(event)):
             say(text)
 
-    def take(record: ReconRecord) -> None:
-        if output is None:
-            held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a temporary file
-
     wanted = selection_of(source, selection, rows=rows, views=views, binning=binning)
-    with target_of(output, take) as given:
+    with target_of(output) as given:
         target = replace(given, names=volume_names_of(chosen))
         place = str(source.path) if path is not source else list(map(str, (each.path for each in source.scans)))
         command = f"beamline.api.reconstruct({place!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
-        reconstruct_file(options, sink, SystemClock(), StopOnSignal())
-    (record,) = made
-    return record if output is not None else replace(record, volume=held[0], output=None, outputs={})
+        record = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
+    return record if output is not None else replace(record, output=None, outputs={})
 
 
 def _method(method: str | Method) -> Method:
-    if isinstance(method, type):
-        name = method.__name__
-        raise ConfigError(f"method is the class {name}; give a name or an object, such as {name}(). Nothing was read.")
     if not isinstance(method, str):
         return method
     try:
@@ -138,13 +126,13 @@ def selection_of(
 
 
 @contextmanager
-def target_of(output: str | Path | None, take: Callable[[ReconRecord], None]) -> Iterator[OutputPaths]:
-    """Where a result goes, with its report; without an output `take` alone gets it."""
+def target_of(output: str | Path | None) -> Iterator[OutputPaths]:
+    """Where a result goes, with its report; without an output nothing is written."""
     if output is not None:
-        yield OutputPaths(Path(output), report_beside(Path(output)), take=take)
+        yield OutputPaths(Path(output), report_beside(Path(output)))
         return
     with tempfile.TemporaryDirectory(prefix="beamline-") as work:
-        yield OutputPaths(Path(work) / "volume.h5", None, written=False, take=take)
+        yield OutputPaths(Path(work) / "volume.h5", None, written=False)
 
 
 def _rows(source: SourceOptions | EnergyScans, rows: slice | tuple[int, int]) -> tuple[int, int]:

@@ -9,19 +9,25 @@ import json
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 from urllib.parse import urlsplit
 
+import click
+
 from beamline.config.load import Config
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone
 from beamline.scan.preflight import dry_run
 from beamline.storage.writers import layout
 
 Emit = Callable[[str, Mapping[str, Any]], object]
 """Takes a document: its name and its values."""
+
+if TYPE_CHECKING:
+    from beamline.core.events import Sink
 
 STREAM = "primary"
 REACH = 1.0
@@ -236,3 +242,25 @@ def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
         yield publisher
     finally:  # its own close would wait for ever for a proxy that no longer reads
         publisher._context.destroy(linger=round(1000 * REACH))
+
+
+def sink(config: Config, place: str, held: ExitStack) -> Sink:
+    """A sink of events that adds the documents to a file, or sends them to a proxy of 0MQ (tcp://HOST:PORT).
+
+    Args:
+        held: closes file and connection.
+
+    Raises:
+        ConfigError: a library is missing, or no proxy answers.
+        DataError: the file cannot be written to.
+    """
+    event_model()  # where it is missing, no file is made
+    if "://" in place:
+        warn = partial(click.echo, err=True)
+        return Documents(config, held.enter_context(published(place, warn)))
+    path = Path(place)
+    try:
+        stream = held.enter_context(path.open("a", encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path} cannot be written to ({error.strerror}). Nothing was started.") from error
+    return Documents(config, json_lines(stream))

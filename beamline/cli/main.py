@@ -7,7 +7,6 @@ import io
 import os
 import sys
 import warnings
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -16,6 +15,7 @@ import click
 from click.exceptions import Abort, ClickException, Exit
 from click.shell_completion import CompletionItem
 
+from beamline.cli.commands import CORE, CommandEntry, commands, own_commands
 from beamline.core.errors import (
     INTERRUPTED,
     BeamlineError,
@@ -27,6 +27,7 @@ from beamline.core.errors import (
 )
 from beamline.core.shipped import version
 from beamline.core.text import printable, size
+from recon.base.registry import did_you_mean
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
 """Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
@@ -98,86 +99,6 @@ def _nowhere() -> TextIO:
     return open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123 - as long as the process
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """The module of a command and its help line, which `beamline --help` prints without importing it (and torch).
-
-    Attributes:
-        files: its results are files or moves; its output is only a summary.
-    """
-
-    module: str
-    help: str
-    files: bool = True
-
-
-_COMMANDS = {
-    "demo": _Entry("demo", "Run a simulated scan with live reconstruction; writes a volume and a report."),
-    "check": _Entry("config", "Validate a configuration. Nothing moves.", files=False),
-    "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves.", files=False),
-    "home": _Entry("home", "Search the stage's reference position. The stage turns."),
-    "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
-    "align": _Entry("tune", "Take a pair of views and say axis, tilt and sharpness, with the corrections."),
-    "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
-    "runs": _Entry("runs", "List the runs in a folder: sample, frames, state, size, flags.", files=False),
-    "watch": _Entry("watch", "Show a run in the browser while it goes on, and afterwards."),
-    "ioc": _Entry("ioc", "Serve the running scan as EPICS process variables.", files=False),
-    "pause": _Entry("control", "Pause a running scan, from another terminal: no view is lost."),
-    "resume": _Entry("control", "Let a paused scan go on."),
-    "stop": _Entry("control", "Stop a running scan cleanly, from another terminal."),
-    "abort": _Entry("control", "Abort a running scan at once, from another terminal."),
-    "simulate": _Entry("simulate", "Simulate a scan of a scene, with labels and truth."),
-    "xafs": _Entry("xafs", "Find a material's absorption edge and the energy of its highest contrast."),
-    "recon": _Entry("recon", "Reconstruct a scan, finished or still running."),
-    "materials": _Entry("materials", "Fit the volume of each material to scans at several energies."),
-    "batch": _Entry("batch", "Reconstruct many scans by one recipe; a table says what became of each."),
-    "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
-    "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
-    "view": _Entry("view", "Show one or two volumes in the browser: slices, histogram, profile, difference."),
-    "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
-    "bench": _Entry("bench", "Measure this machine: kernels, fits, quality against time, and acquisition."),
-    "info": _Entry("files", "Describe a scan file or a volume.", files=False),
-    "validate": _Entry("files", "Check a scan file or a volume against the rules of its format.", files=False),
-    "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
-    "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
-    "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False),
-    "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
-    "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
-    "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
-    "surface": _Entry("surface", "Write the surface of a volume, or of its Gaussians, as a watertight mesh."),
-    "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
-    "completion": _Entry("man", "Print the completion script of a shell.", files=False),
-    "man": _Entry("man", "Print the manual page of a command.", files=False),
-    "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
-}
-
-
-@dataclass(frozen=True)
-class _Libraries:
-    """What the libraries of some commands need, under a limit of addresses.
-
-    Attributes:
-        addresses: bytes that a command on a tiny scan takes at its peak, with one thread of BLAS, and a twentieth more;
-            measured on Linux with two cores.
-        early: modules that are otherwise loaded late, when data have taken the room.
-    """
-
-    commands: str
-    addresses: int
-    early: tuple[str, ...]
-
-
-_LIBRARIES = (
-    _Libraries(
-        "demo recon materials batch tradeoff study bench voxelise render",
-        1_850_000_000,
-        ("scipy.linalg", "torch", "matplotlib.figure"),
-    ),
-    _Libraries("monitor scan tune align simulate", 1_350_000_000, ("scipy.linalg", "scipy.ndimage")),
-    _Libraries("xafs view segment info validate archive ingest export surface", 800_000_000, ("scipy.linalg",)),
-)
-
-
 def _load_early(modules: tuple[str, ...]) -> None:
     """Load these libraries, and the compiler of kernels, before data take the room.
 
@@ -194,18 +115,20 @@ def _nothing() -> None:
     pass
 
 
+def _command(name: str) -> CommandEntry | None:
+    """Other packages are asked, which takes a tenth of a second, only where the name is not ours."""
+    return own_commands().get(name) or commands().get(name)
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
+        return list(commands())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        entry = _COMMANDS.get(cmd_name)
-        if entry is None:
-            return None
-        command: click.Command = getattr(import_module(f"beamline.cli.{entry.module}"), cmd_name)
-        return command
+        command = _command(cmd_name)
+        return None if command is None else command.load(cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -213,8 +136,8 @@ class LazyGroup(click.Group):
         """As click does. DataError where a limit leaves no room for the libraries: some end the process then."""
         from beamline.core.machine import memory_limit  # here, so that the help loads without it
 
-        libraries = next((each for each in _LIBRARIES if args and args[0] in each.commands.split()), None)
-        if libraries is not None and (limit := memory_limit()) is not None:
+        command = _command(args[0]) if args else None
+        if command is not None and (libraries := command.libraries).early and (limit := memory_limit()) is not None:
             if limit < libraries.addresses:
                 raise DataError(
                     f"Out of memory: this process may use {size(limit)} of address space (ulimit -v), and the "
@@ -222,15 +145,21 @@ class LazyGroup(click.Group):
                     "written."
                 )
             _load_early(libraries.early)
+        if args and command is None and args[0][:1] not in ("", "-"):
+            ctx.fail(f"There is no command {args[0]!r}{did_you_mean(args[0], commands())}.")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        features = [(name, command.help) for name, command in commands().items() if name not in CORE]
         with formatter.section("Commands"):
-            formatter.write_dl([(name, entry.help) for name, entry in _COMMANDS.items()])
+            formatter.write_dl([(name, command.help) for name, command in CORE.items()])
+        if features:
+            with formatter.section("More commands"):
+                formatter.write_dl(features)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         names = [
-            CompletionItem(name, help=entry.help) for name, entry in _COMMANDS.items() if name.startswith(incomplete)
+            CompletionItem(name, help=each.help) for name, each in commands().items() if name.startswith(incomplete)
         ]
         return names + click.Command.shell_complete(self, ctx, incomplete)
 
@@ -282,6 +211,7 @@ def run() -> NoReturn:
     closed terminal, or a disk that takes no output, does not end a command: the rest of its output is lost.
     """
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
+    warnings.showwarning = lambda message, *_: click.echo(f"Warning: {printable(str(message))}", err=True)
     outputs, code = Outputs(), 0
     try:
         main(prog_name="beamline")
@@ -292,8 +222,8 @@ def run() -> NoReturn:
     exec("")  # else Python ends by SIGINT if Ctrl-C came in such a text, as dataclasses run, though it was caught
     if lost := outputs.lost():
         click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
-        entry = _COMMANDS.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
-        if code == 0 and (entry is None or not entry.files):
+        command = _command(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
+        if code == 0 and (command is None or not command.files):
             code = DataError.exit_code
     if code and _holds_hdf5_files():
         os._exit(code)

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
-from beamline.cli.options import POSITIVE, declared, option, parsed, rules_of, run_option, together
+from beamline.cli.options import POSITIVE, NameChoice, declared, option, parsed, rules_of, run_option, together
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
@@ -136,7 +136,7 @@ def resumes_slabs(path: Path | None) -> bool:
 preset_option = option(
     "--preset",
     of_one_call=True,  # it is in the name of the method
-    type=click.Choice(PRESETS_OF_METHODS),
+    type=NameChoice(PRESETS_OF_METHODS),
     help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
     "The same as the method r2-published.",
 )
@@ -214,8 +214,9 @@ method_options = together(
     run_option(
         "--seconds",
         type=POSITIVE,
-        help="Time of the whole call, from reading the scan to volume and report, instead of --steps. If it is too "
-        "little, a warning says so before the fit. With --follow: of the fit after the end of the scan.",
+        help="Time of the whole call, instead of --steps: the fit gets what reading, correction, report and writing "
+        "leave, which it does not shorten. If that is nothing, a warning says when the call will end. With --follow: "
+        "of the fit after the end of the scan.",
     ),
     run_option(
         "--budget",
@@ -225,24 +226,24 @@ method_options = together(
     ),
     run_option(
         "--quality",
-        type=click.Choice(list(PRESETS)),
+        type=NameChoice(list(PRESETS)),
         help="Preset of steps and Gaussians.",
     ),
     _GAUSSIANS,
     run_option(
         "--start",
-        type=click.Choice(get_args(Start)),
+        type=NameChoice(get_args(Start)),
         help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
         "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
     ),
     run_option(
         "--loss",
-        type=click.Choice(get_args(Loss)),
+        type=NameChoice(get_args(Loss)),
         help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
     ),
     run_option(
         "--kernel",
-        type=click.Choice([kernel.value for kernel in Kernel]),
+        type=NameChoice([kernel.value for kernel in Kernel]),
         help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
     ),

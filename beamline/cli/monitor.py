@@ -119,7 +119,7 @@ def _watched(
     from beamline.projections.returned import returned_views
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
-    from beamline.storage.rules.validate import scan_ended
+    from beamline.storage.rules.scan import scan_ended
 
     progress, follow = counting("monitor", sink, clock), clock if request.follow else None
     frames: list[Judged] = []

@@ -6,7 +6,7 @@ import itertools
 import math
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import field, fields
 from datetime import datetime
@@ -23,6 +23,8 @@ from beamline.core.events import Event, Failed, Sink
 from beamline.core.sinks import JsonLines, fan_out
 from beamline.reconstruct.option_rules import RULES, OptionRule, contradiction
 from drivers.base.clock import SystemClock
+from recon.base.registry import unknown
+from recon.methods import METHODS
 
 
 class FiniteRange(click.FloatRange):
@@ -38,6 +40,39 @@ class FiniteRange(click.FloatRange):
         """In a help page; click's own says `x<=None` without bounds."""
         return "" if self.min is None and self.max is None else super()._describe_range()
 
+
+class NameChoice(click.Choice):  # type: ignore[type-arg]
+    """Some names; an error names the nearest one."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(self.refusal(value), param, ctx)
+
+    def refusal(self, value: str) -> str:
+        return unknown("", value, self.choices)
+
+
+class MethodChoice(NameChoice):
+    """Names of methods; of one that another command takes, an error names that command."""
+
+    def refusal(self, value: str) -> str:
+        return unknown_method(value, self.choices)
+
+
+def unknown_method(name: str, legal: Iterable[str]) -> str:
+    """Why a method is not taken; without a full stop."""
+    if (entry := METHODS.get(name)) is not None and entry.several in _ELSEWHERE:
+        return f"{name!r} {_ELSEWHERE[entry.several]}"
+    return unknown("method", name, legal)
+
+
+_ELSEWHERE = {
+    "times": "makes several volumes, in time: use beamline recon --time N, or beamline tradeoff --time N",
+    "materials": "takes scans at several energies: use beamline materials, or beamline tradeoff --spectra TABLE",
+}
+"""Of methods that make several volumes: what takes them."""
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)

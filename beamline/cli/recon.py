@@ -25,22 +25,21 @@ from beamline.cli.options import (
     rules_of,
 )
 from beamline.cli.recipe import names_given, recipe_text, repeating
-from beamline.cli.recon_options import SHEET, recon_options
+from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
-from beamline.cli.terminal import counting, events_shown, results
+from beamline.cli.terminal import events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
-from beamline.core.files import write_whole
+from beamline.core.events import Done, Event, FitReached, StateEntered
+from beamline.core.files import refuse_existing, write_whole
 from beamline.core.process import EndsWithParent
 from beamline.core.sinks import fan_out
 from beamline.core.stop import StopOnSignal
-from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS_RESUMED, of_other_methods
+from beamline.reconstruct.option_rules import RULES, SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
 
 if TYPE_CHECKING:
-    from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
     from beamline.storage.recon_record import ReconRecord
 
@@ -62,57 +61,66 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
     context = click.get_current_context()
-    axes = None if isinstance(values["axis"], float | None) else values["axis"]
     slabs = values["resume"] if resumes_slabs(values["resume"]) else None
-    method = _checked_method(context, method, axes, slabs)
-    path = output or Path(f"{file.stem}{f'_{method}.h5' if axes is None else f'_axis{SHEET}'}")
-    if (path.suffix.lower() == SHEET) != (axes is not None):
-        what, suffix = ("only --axis try", ".h5") if axes is None else ("--axis try", SHEET)
-        example = path.with_suffix(suffix)
-        raise click.UsageError(f"-o {output}: {what} writes a picture; give a name such as {example}.")
+    method = _checked_method(context, method, slabs)
+    path = output or Path(f"{file.stem}_{method}.h5")
     if not values["follow"] and values["write_config"] is None and values["log"] is None:  # a log holds the failure
         require_there(file, values["as_json"])
-    options = _options(context, file, method, path, values | {"axis": None if axes is not None else values["axis"]})
+    options = _options(context, file, method, path, values)
     if values["write_config"] is not None:
         if output is not None:
             options.target.refuse_existing()
         _write_recipe(values["write_config"], options.recipe)
         if output is None:
             return
-    if axes is not None:
-        _try_axes(options, axes, path, values["as_json"])
-    elif values["dry"]:
+    if values["dry"]:
+        if values["log"] is not None:
+            refuse_existing(values["log"])
         dry_run(options, SystemClock(), values["as_json"])
     else:
         run_reconstruction(options, values)
 
 
-def _checked_method(context: click.Context, method: str | None, axes: AxisRange | None, slabs: Path | None) -> str:
+def _checked_method(context: click.Context, method: str | None, slabs: Path | None) -> str:
     """The method's name, after all options were found to go together and with it.
 
     Args:
-        axes: those of --axis try.
         slabs: partial volume that --resume names.
 
     Raises:
         UsageError: they do not.
     """
-    asked, rules = names_given(context) | ({AXIS_TRIALS} if axes is not None else set()), rules_of(context.command)
+    asked, rules = names_given(context), rules_of(context.command)
     if slabs is not None:
         asked = asked - {"resume"} | {SLABS_RESUMED}
     values = context.params
     method = preset_of(method, values["preset"])
+    stated = method is not None
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
-        method = IN_TIME if "time" in asked else DEFAULT if of_fits else AUTO
+        method = _in_time() if "time" in asked else DEFAULT if of_fits else AUTO
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {slabs}"})
-    if why := of_other_methods(rules, asked, method):
+    if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
     for step in chosen_steps(values) if values["follow"] else ():
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
     return method
+
+
+def _in_time() -> str:
+    if IN_TIME is None:
+        raise click.UsageError("--time: this installation makes no volumes in time. Leave it out.")
+    return IN_TIME
+
+
+def refuse_recipe(config: Path) -> None:
+    """Raise UsageError for a recipe whose options do not go together, or with a volume, whatever the scan."""
+    with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
+        values = dict(context.params)
+        method = _checked_method(context, values["method"], None)
+        method_with(method, settings_of(recon, values), values["any_setting"])
 
 
 def _options(context: click.Context, file: Path, method: str, path: Path, values: Mapping[str, Any]) -> ReconOptions:
@@ -122,7 +130,7 @@ def _options(context: click.Context, file: Path, method: str, path: Path, values
         UsageError: a file is named twice, or the method cannot do what is asked.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
-    from beamline.reconstruct.options import ReconOptions
+    from beamline.reconstruct.options import FollowTiming, ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from recon.voxels.enough_views import Goal
 
@@ -145,11 +153,14 @@ def _options(context: click.Context, file: Path, method: str, path: Path, values
         checkpoints=CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
         enough=None if goal == (None, None) else Goal(*goal),
         partial=partial,
+        follow=FollowTiming() if values["follow"] else None,
         command=repeating(context, file, path, () if partial is None else ("resume",)),
         recipe=recipe_text(context, method),
         filter=values["filter"],
         seed=values["seed"],
-        **{rule.value: values[rule.value] for rule in RULES.values() if rule.value in values},
+        **{
+            rule.value: values[rule.value] for rule in RULES.values() if rule.value in values and rule.value != "follow"
+        },
     )
 
 
@@ -166,18 +177,10 @@ def run_reconstruction(
         ScanStopped: it was ended early; the volume was written. DataError, QualityError: it was, and something is not
         as it should be.
     """
-    reconstruct: Callable[..., Mapping[str, float]]
-    if values.get("follow"):  # each loads what only it needs
-        from beamline.reconstruct.follow import follow
+    from beamline.reconstruct.pipeline import reconstruct_file  # here: help needs none of it
 
-        reconstruct = follow
-    else:
-        from beamline.reconstruct.offline import reconstruct_file
-
-        reconstruct = reconstruct_file
-    last: list[Event] = []
     limit = values.get("max_residual")
-    stop = StopOnSignal(ready=bool(values.get("follow")) or options.budget is not None)
+    stop = StopOnSignal(ready=options.follow is not None or options.budget is not None)
 
     def made(event: Event) -> None:
         """From the first step or iteration on there is a volume; what has a unit is a trial, or slices.
@@ -191,19 +194,18 @@ def run_reconstruction(
     with events_shown(values["as_json"]) as usual:
         shown = LogLines(sys.stderr, terminal=True) if values.get("verbose") and not values["as_json"] else usual
         with logged(values.get("log"), shown) as lines:
-            sink = fan_out(last.append, made, *lines, shown)
+            sink = fan_out(made, *lines, shown)
             scope = EndsWithParent(stop, sys.stdin.fileno()) if values.get("beside") else stop
-            metrics = reconstruct(options, sink, SystemClock(), stop_scope=scope)
-    done, output = last[-1], " and ".join(map(str, options.target.outputs))
-    assert isinstance(done, VolumeDone)
+            record = reconstruct_file(options, sink, SystemClock(), stop_scope=scope)
+    output = " and ".join(map(str, options.target.outputs))
     if not values["as_json"]:
-        click.echo("\n".join([results(done.record), *more(done.record)]))
-    if lost := done.record.parameters.get("checkpoint_lost"):
+        click.echo("\n".join([results(record), *more(record)]))
+    if lost := record.parameters.get("checkpoint_lost"):
         raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
-    if done.record.ended_early:
+    if record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if limit is not None:
-        require(metrics, limit)
+        require(record.metrics, limit)
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
@@ -227,21 +229,6 @@ def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
         sink(Done(needs, time=clock.now()))
     if not as_json:
         click.echo("\n".join(needs.lines()))
-
-
-def _try_axes(options: ReconOptions, axes: AxisRange, path: Path, as_json: bool) -> None:
-    """Write a picture of one slice by each of some axes."""
-    from beamline.reconstruct.axis_trials import try_axes
-
-    last: list[Event] = []
-    with events_shown(as_json) as shown:
-        sink, clock = fan_out(last.append, shown), SystemClock()
-        try_axes(options, axes, path, sink, clock, counting("axes", sink, clock))
-    if not as_json:
-        done = last[-1].data
-        scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())
-        click.echo(f"axis    share below 0 (lower is better)\n{scores}\nbest    {done['axis_col']:g}\nsheet   {path}")
-        click.echo(f"If the picture agrees: beamline recon {options.source.path} --axis {done['axis_col']:g}", err=True)
 
 
 def _write_recipe(path: Path, text: str) -> None:

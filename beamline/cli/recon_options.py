@@ -13,6 +13,8 @@ from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
+    MethodChoice,
+    NameChoice,
     json_option,
     option,
     parsed,
@@ -26,18 +28,11 @@ from beamline.cli.recipe import config_option
 from beamline.cli.selection_options import selection_options
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.choices import AUTO
+from recon.base.registry import in_folders
 from recon.methods import names_of_one_scan
 
 if TYPE_CHECKING:
-    from beamline.reconstruct.region import Region
-
-SHEET = ".png"
-"""Suffix of the picture of --axis try."""
-
-
-def output_path(text: str) -> Path:
-    """The path of a volume, or of the picture of --axis try. ValueError for another suffix."""
-    return Path(text) if Path(text).suffix.lower() == SHEET else volume_path(text)
+    from beamline.reconstruct.region import AroundSample, Region
 
 
 def memory_size(text: str) -> int:
@@ -50,17 +45,21 @@ def memory_size(text: str) -> int:
 
 def cluster_of(text: str) -> str:
     """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
-    from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
+    from beamline.reconstruct.workers import cluster  # here: help needs none of it
 
-    check_cluster(text)
+    cluster().check_cluster(text)
     return text
 
 
-def region_of(text: str) -> Region:
-    """A box of voxels, `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
-    from beamline.reconstruct.region import Region  # here: help needs none of it
+_OF_FEATURES = in_folders("recon.features", "METHODS").items()
+_FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not (entry.several or entry.emission))
 
-    return Region.parse(text)
+
+def region_of(text: str) -> Region | AroundSample:
+    """A box of voxels, `z0:z1,y0:y1,x0:x1`, or that around the sample, `auto`. ValueError for anything else."""
+    from beamline.reconstruct.region import AroundSample, Region  # here: help needs none of it
+
+    return AroundSample() if text == "auto" else Region.parse(text)
 
 
 report_option = option(
@@ -92,10 +91,10 @@ recon_options = together(
     option(
         "-m",
         "--method",
-        type=click.Choice((AUTO, *names_of_one_scan())),
+        type=MethodChoice((AUTO, *names_of_one_scan())),
         help="auto chooses fbp, fista-tv, pnp-dct or r2 by views held out. r2 fits Gaussians to the views, "
-        "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
-        "options of the fit.",
+        "fbp is filtered back-projection, the others iterate on voxels; "
+        f"{_FOR_COMPARISON} are there for comparison. Default: auto; r2 with --follow and with options of the fit.",
     ),
     selection_options,
     method_options,
@@ -103,7 +102,7 @@ recon_options = together(
     heading(METHOD),
     option(
         "--filter",
-        type=click.Choice(["ram-lak", "shepp-logan", "hann"]),
+        type=NameChoice(["ram-lak", "shepp-logan", "hann"]),
         default="hann",
         show_default=True,
         help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
@@ -135,9 +134,8 @@ recon_options = together(
         "--output",
         of_one_call=True,
         metavar="PATH",
-        callback=parsed(output_path),
-        help=f"Output: {suffixes_text()}; of --axis try a .png. "
-        "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
+        callback=parsed(volume_path),
+        help=f"Output: {suffixes_text()}. Default: FILE's stem + _METHOD.h5, in this folder.",
     ),
     report_option,
     heading(DATA),
@@ -182,10 +180,10 @@ recon_options = together(
     run_option(
         "--roi",
         "region",
-        metavar="Z0:Z1,Y0:Y1,X0:X1",
+        metavar="Z0:Z1,Y0:Y1,X0:X1|auto",
         callback=parsed(region_of),
         help="Box of voxels to write, of the volume that the same options give without this one. It is made of the "
-        "rows that show it; fbp makes these voxels alone.",
+        "rows that show it; fbp makes these voxels alone. auto: the box around the sample, as coarse views show it.",
     ),
     option(
         "--write-config",
@@ -195,7 +193,7 @@ recon_options = together(
         help="Write the options of this call as a recipe to this file (-: print it). Without -o that is all that is "
         "done.",
     ),
-    run_option(
+    option(
         "--log",
         of_one_call=True,
         repeated=False,

@@ -3,36 +3,42 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
+from beamline.cli.page_beside import PageBeside
 from beamline.cli.terminal import Terminal
-from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Done, Sink
+from beamline.core.files import remove
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
+from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
     from beamline.core.run_result import RunResult
+    from beamline.scan.energies import SeriesRun
     from beamline.scan.resume import ResumableRun
+
+TABLE = ".csv"  # suffix of a table of scans
 
 
 @dataclass(frozen=True, eq=False)
 class ScanRequest:
     """What `beamline scan` is asked for."""
 
-    file: Path | None = set_by(
-        click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
+    files: tuple[Path, ...] = set_by(
+        click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
     )
     dry: bool = set_by(
         "--dry-run", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
@@ -43,6 +49,9 @@ class ScanRequest:
         is_flag=True,
         help="Run CONFIG, of a real instrument, with the simulated counterparts of its devices.",
     )
+    discard: bool = set_by(
+        "--discard", is_flag=True, help="With --rehearse: remove the folder of a run that ended well, and its frames."
+    )
     page: bool = set_by("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
     no_live: bool = set_by("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
     documents: str | None = set_by(
@@ -51,6 +60,12 @@ class ScanRequest:
         type=click.Path(dir_okay=False),
         help="Add the documents of bluesky to FILE, one a line, or send them to a proxy of 0MQ. "
         'Needs: pip install "splatline[bluesky]".',
+    )
+    stop_on_failure: bool = set_by(
+        "--stop-on-failure", is_flag=True, help="Of several scans: begin none after the first one that fails."
+    )
+    wait: bool = set_by(
+        "--wait", is_flag=True, help="Of several scans: wait for Enter before each but the first, to change the sample."
     )
     as_json: bool = set_by(json_option)
     output: Path | None = set_by(
@@ -67,11 +82,19 @@ class ScanRequest:
         "configuration.",
     )
 
+    @property
+    def file(self) -> Path | None:
+        """The configuration of a single scan."""
+        return self.files[0] if self.files else None
+
 
 @click.command()
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
     """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
+
+    Several CONFIGs, or a TABLE with a line for each scan (docs/commands.md), are taken one after the other. One that
+    fails does not stop the others; Ctrl-C does.
 
     With `scan.energies` it is a series: a scan of each energy, in one folder, which --resume takes too.
 
@@ -86,12 +109,15 @@ def scan(request: ScanRequest) -> None:
 
     file, run = request.file, request.run
     _refuse_contradictions(request)
+    if _are_several_scans(request.files):
+        _queue().take_all(request)
+        return
     with json_events(request.as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, request.overrides, rehearse=request.rehearse)
         of_energies = _config_of_energies(config, run, request.documents)
         if of_energies is not None:
             if not request.dry:
-                _run_energies(of_energies, request, json_sink)
+                _show_energies(take_energies(of_energies, request, [json_sink], StopRequest()), request, json_sink)
                 return
             run, config = None, of_energies
         try:
@@ -108,17 +134,37 @@ def scan(request: ScanRequest) -> None:
         if request.dry:
             _dry_run(config, request.output, series, json_sink, request.as_json)
             return
-        result = _run_one(config, series, request, json_sink, held)
+        result = run_one(config, series, request, [json_sink], held)
+        rehearsed = rehearsed_lines(config, result, request) if request.rehearse else []
     if not request.as_json:
-        click.echo(_results(result))
-    if faults := _faults(result):
+        click.echo("\n".join([_results(result), *rehearsed]))
+    if faults := faults_of(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
+    """How long a rehearsal took and the scan will take. `--discard` removes its folder where all frames are good."""
+    from beamline.plan.timeline import duration_text
+    from beamline.scan.preflight import dry_run
+
+    planned = duration_text(dry_run(config, request.output).timeline.duration)
+    lines = [
+        f"{'rehearsed':<10}in {duration_text(result.seconds)}. At the instrument the plan takes {planned}, without "
+        "moves of shutter and sample"
+    ]
+    if request.discard and not faults_of(result):
+        remove(result.folder)
+        lines.append(f"{'discarded':<10}{result.folder}")
+    return lines
 
 
 def _refuse_contradictions(request: ScanRequest) -> None:
     """Raises UsageError for options that do not go together."""
+    if request.discard and not request.rehearse:
+        raise click.UsageError("--discard removes what a rehearsal made: give --rehearse.")
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
+    _refuse_for_queue(request)
     if request.run is None:
         return
     if request.output is not None or (request.overrides and request.file is None):
@@ -129,21 +175,52 @@ def _refuse_contradictions(request: ScanRequest) -> None:
         raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
 
 
-def _run_one(
-    config: Config, series: ResumableRun | None, request: ScanRequest, json_sink: Sink, held: ExitStack
+def _are_several_scans(files: Sequence[Path]) -> bool:
+    """Whether these are several configurations, or a table of them."""
+    return len(files) > 1 or any(file.suffix.lower() == TABLE for file in files)
+
+
+def _queue() -> Any:
+    """The module of the feature whose `take_all` takes several scans. UsageError: this installation has none."""
+    modules = in_folders("beamline.features", "QUEUES")
+    if "scan" not in modules:
+        raise click.UsageError("This installation takes one scan at a time: give one CONFIG. Nothing was started.")
+    return import_module(modules["scan"])
+
+
+def _refuse_for_queue(request: ScanRequest) -> None:
+    several = _are_several_scans(request.files)
+    for name, given, of_several in (
+        ("--resume", request.run is not None, False),
+        ("--page", request.page, False),
+        ("--documents", request.documents is not None, False),
+        ("--stop-on-failure", request.stop_on_failure, True),
+        ("--wait", request.wait, True),
+    ):
+        if given and of_several is not several:
+            raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
+
+
+def run_one(
+    config: Config,
+    series: ResumableRun | None,
+    request: ScanRequest,
+    others: Sequence[Sink],
+    held: ExitStack,
+    stop: StopRequest | None = None,
 ) -> RunResult:
     """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
     from beamline.instrument.operator import ask_operator
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
-    stop, how = StopRequest(), commands_of(config, series) if not request.no_live else Commands()
+    stop, how = stop or StopRequest(), commands_of(config, series) if not request.no_live else Commands()
     if how.remark:
         click.echo(how.remark, err=True)
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-        sinks: list[Sink] = [terminal, json_sink, *([beside] if request.page else [])]
+        sinks: list[Sink] = [terminal, *others, *([beside] if request.page else [])]
         if request.documents is not None:
-            sinks.append(_documents(config, request.documents, held))
+            sinks.append(import_module("beamline.bluesky.documents").sink(config, request.documents, held))
         return run_scan(
             config, series or request.output, sinks, stop, live=how.live, afterwards=how.afterwards,
             ask=lambda question: terminal.ask(question, ask_operator),
@@ -170,40 +247,31 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
     return config
 
 
-def _run_energies(config: Config, request: ScanRequest, json_sink: Sink) -> None:
+def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
+    """Take, or go on with, a scan of each energy, with the terminal and the page beside it."""
     from beamline.instrument.operator import ask_operator
     from beamline.scan.energies import run_energies
+
+    if request.discard:
+        raise click.UsageError("--discard does not go with scan.energies: leave it out.")
     from beamline.scan.live_process import Commands, commands_of
 
-    stop = StopRequest()
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-        done = run_energies(
-            config, request.output, [terminal, json_sink, *([beside] if request.page else [])], stop,
+        return run_energies(
+            config, request.output, [terminal, *others, *([beside] if request.page else [])], stop,
             lambda one, rest: Commands() if request.no_live else commands_of(one, rest),
             series=request.run, ask=lambda question: terminal.ask(question, ask_operator),
         )  # fmt: skip
+
+
+def _show_energies(done: SeriesRun, request: ScanRequest, json_sink: Sink) -> None:
     data = {"folder": done.folder, "scans": [{"energy_kev": energy, "path": path} for energy, path in done.scans]}
     json_sink(Done(data, time=SystemClock().now()))
     if not request.as_json:
         click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
-    if faults := [fault for result in done.results for fault in _faults(result)]:
+    if faults := [fault for result in done.results for fault in faults_of(result)]:
         raise AlarmError(f"The scans are complete, but {' '.join(faults)} Look at {done.folder}.")
-
-
-def _documents(config: Config, place: str, held: ExitStack) -> Sink:
-    from beamline.bluesky.documents import Documents, event_model, json_lines, published
-
-    event_model()  # where it is missing, no file is made
-    if "://" in place:
-        warn = partial(click.echo, err=True)
-        return Documents(config, held.enter_context(published(place, warn)))
-    path = Path(place)
-    try:
-        stream = held.enter_context(path.open("a", encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path} cannot be written to ({error.strerror}). Nothing was started.") from error
-    return Documents(config, json_lines(stream))
 
 
 def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
@@ -219,7 +287,7 @@ def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
             click.echo(done.in_words())
 
 
-def _faults(result: RunResult) -> list[str]:
+def faults_of(result: RunResult) -> list[str]:
     """The faults of the frames of a complete scan, and their consequences."""
     from beamline.storage.flag_legend import counted
 

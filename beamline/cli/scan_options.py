@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import POSITIVE, option, parsed, together
+from beamline.cli.options import POSITIVE, NameChoice, option, parsed, together
 
 if TYPE_CHECKING:
     from beamline.projections.scan_statistics import LightAsked
@@ -21,7 +21,7 @@ underscored = parsed(lambda value: value.replace("-", "_"))
 scan_options = together(
     option(
         "--quantity",
-        type=click.Choice(["counts", "transmission", "line-integrals"]),
+        type=NameChoice(["counts", "transmission", "line-integrals"]),
         callback=underscored,
         help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
     ),
@@ -54,9 +54,7 @@ scan_options = together(
         metavar="DATASET",
         help="For any HDF5 file: its angles, one for each projection or frame, in the unit that the dataset states.",
     ),
-    option(
-        "--angles-unit", type=click.Choice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."
-    ),
+    option("--angles-unit", type=NameChoice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."),
 )
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""
 

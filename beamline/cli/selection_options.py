@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
-from beamline.cli.options import POSITIVE, option, parsed, together
+from beamline.cli.options import POSITIVE, NameChoice, option, parsed, together
 from beamline.cli.scan_options import scan_options
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
@@ -20,7 +20,6 @@ from beamline.projections.step import Option, options_of
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
-    from beamline.reconstruct.axis_trials import AxisRange
     from beamline.storage.readers.open import SourceOptions
 
 
@@ -32,26 +31,18 @@ def span(value: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def column(value: str) -> float | AxisRange | None:
-    """A column of the detector, or several to try; None for "auto". ValueError for anything else."""
+def column(value: str) -> float | None:
+    """A column of the detector; None for "auto". ValueError for anything else."""
     if value == "auto":
         return None
     if value.startswith("try:"):
-        from beamline.reconstruct.axis_trials import AxisRange
-
-        try:
-            first, last, step = (float(part) for part in value.split(":")[1:])
-            return AxisRange(first, last, step)
-        except ValueError as error:
-            raise ValueError(f"{value!r} is not try:FIRST:LAST:STEP, e.g. try:80:90:0.5 ({error})") from error
+        raise ValueError(f"slices by several axes are drawn by beamline sweep FILE axis={value.removeprefix('try:')}")
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(
-            f"{value!r} is neither a column (0 is the centre of the first one), nor auto, nor try:FIRST:LAST:STEP"
-        )
+        raise ValueError(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
     return number
 
 
@@ -76,8 +67,6 @@ def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOpti
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
 
-    if values["axis"] is not None and not isinstance(values["axis"], float):
-        raise click.UsageError("--axis try is for beamline recon.")
     pixel_size_um = values["pixel_size_um"]
     selection = Selection(
         views=values["views"],
@@ -110,7 +99,7 @@ def _of_step(asked: Option) -> Callable[..., Any]:
     """An option of a step as an option of the command line."""
     return option(
         asked.name,
-        type=click.Choice(asked.choices) if asked.choices else click.Path(path_type=Path) if asked.path else str,
+        type=NameChoice(asked.choices) if asked.choices else click.Path(path_type=Path) if asked.path else str,
         callback=parsed(lambda value: asked.parse(str(value))),
         default=asked.default,
         show_default=asked.default is not None,
@@ -151,15 +140,22 @@ _BEFORE = (
     option(
         "--axis",
         callback=parsed(column),
-        metavar="PX|auto|try:A:B:STEP",
+        metavar="PX|auto",
         default="auto",
         show_default=True,
         help="Rotation axis: column of the unbinned detector (0: centre of the first column used), or auto to find it. "
-        "recon with try:80:90:0.5 draws one slice by each of these axes with its score (PNG), and ends.",
+        "beamline sweep FILE axis=80:90:0.5 draws a slice by each of these axes.",
     ),
 )
 _AFTER = (
     heading(DATA),
+    option(
+        "--frames-per-view",
+        type=click.IntRange(min=1),
+        metavar="N",
+        help="Average N successive projections to one view, such as those that a step scan takes at one angle; 1: "
+        "average none. Default: as the plan in the scan file says.",
+    ),
     option(
         "--pixel-size-um",
         type=POSITIVE,

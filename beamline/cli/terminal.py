@@ -9,10 +9,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TextIO
+from functools import cache
+from typing import TYPE_CHECKING, Self, TextIO
 
-import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -33,12 +32,12 @@ from beamline.core.events import (
 )
 from beamline.core.machine_speed import seconds_left
 from beamline.core.narration import sentence
-from beamline.core.sinks import Warn, Warnings
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
-from drivers.base.clock import Clock, SystemClock
+from drivers.base.clock import Clock
 from drivers.manual import Ask
+from recon.base.registry import in_folders
 from recon.methods import BASELINE
 
 if TYPE_CHECKING:
@@ -51,7 +50,12 @@ _COUNTED = {
     **dict.fromkeys(("ingest", "xafs", "monitor", "correction", "validate"), ("frames", "frames")),
     "archive": ("written and compared", "MB"),
 }  # stage: the name of its bar and what it counts; other stages are named after what they count
-_OF_TRIALS = {"tradeoff": "trials", "study": "trials", "batch": "scans", "bench": "runs"}  # stage: unit of its progress
+
+
+@cache
+def _counted_by_features() -> dict[str, str]:
+    """What a stage of a feature counts: COUNTED of its folder; trials where it says nothing."""
+    return in_folders("beamline.features", "COUNTED")
 
 
 class Terminal:
@@ -117,7 +121,8 @@ class Terminal:
             case PhaseReached():
                 self._show_phase(event)
             case TrialReached(stage, n, of):
-                self._show(_OF_TRIALS[stage], n, of, trials(event, _OF_TRIALS[stage]))
+                what = _counted_by_features().get(stage, "trials")
+                self._show(what, n, of, trials(event, what))
             case KernelsCompiled(_, n, seconds):
                 self._show("kernels", n, 0, f"{n} compiled in {seconds:.0f} s; once on a machine, 1 to 2 minutes")
             case FitReached(_, step, steps):
@@ -189,19 +194,6 @@ def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
     if not (done.of and done.per_s) or done.eta_s is None:
         return "begun"
     return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
-
-
-def print_dry_run(plan: Callable[[Warn], tuple[Any, Any]], folder: Path, as_json: bool) -> None:
-    """Print what a comparison will take; see `beamline.trials.dry_run`."""
-    from beamline.core.machine_speed import MachineSpeed
-    from beamline.trials.dry_run import dry_run
-
-    clock = SystemClock()
-    with events_shown(as_json) as sink:
-        expected = dry_run(plan, folder, Warnings(sink, clock), MachineSpeed())
-        sink(Done(expected, time=clock.now()))
-    if not as_json:
-        click.echo("\n".join(expected.lines()))
 
 
 def trials(done: TrialReached, what: str = "trials") -> str:

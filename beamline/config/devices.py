@@ -4,28 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from beamline.config.monochromator import MonochromatorConfig, NoMonochromator
-from beamline.config.places import (
-    FilterConfig,
-    MotorSection,
-    NoFilter,
-    PvUrl,
-    PvValue,
-    Seconds,
-    StageMover,
-    without,
-)
+from beamline.config.beam import BeamMonitorSection, NoBeamMonitor
+from beamline.config.monochromator import FoundMonochromator, HandMonochromator, NoMonochromator, SceneMonochromator
+from beamline.config.places import FoundFilter, MotorFilter, MotorSection, NamedFilter, NoFilter, StageMover
 from beamline.config.section import Section, declared, read_from, section_of
+from beamline.config.shutters import FoundShutter, StageOutputShutter
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
-from drivers.beam_monitors.reading import PATTERN, QUERY, pattern_problem, url_problem
 from drivers.cameras import CAMERAS
-from drivers.epics.devices import ShutterPvs
+from drivers.orca_quest import DcamOptions
 from drivers.stages.registry import STAGES
+from recon.base.registry import in_folders
 
 Roi = Annotated[
     tuple[
@@ -61,7 +54,7 @@ class SimulatedOrca(_Orca):
     kind: Literal["simulated_orca"]
 
 
-class DcamOrca(_Orca):
+class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
     library: str | None = None
     """Path of the DCAM-API library; null: the installed one."""
@@ -69,29 +62,18 @@ class DcamOrca(_Orca):
     """Which camera, where DCAM finds several."""
     link: Literal["usb3", "coaxpress"] = "usb3"
     """USB3 carries 17.7 full frames a second, CoaXPress 120."""
-    trigger_active: Literal["edge", "level", "sync_readout"] = "edge"
-    """edge: a pulse begins an exposure of exposure_s. level: the pulse's length is the exposure; set exposure_s to it.
-    sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan takes."""
-    trigger_mode: Literal["normal", "start"] = "normal"
-    """start: the first pulse begins a free run, which no fly scan takes."""
-    trigger_times: Annotated[int, Field(ge=1, le=10_000)] = 1
-    """Every so many pulses make one frame; a fly scan takes 1."""
-    trigger_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """From a pulse to the exposure; the angle in the file stays that of the pulse."""
-    global_exposure: Literal["delayed", "global_reset"] = "delayed"
-    """delayed: rolling shutter. global_reset: all rows begin at once, later rows expose longer unless light is cut."""
-    hot_pixels: Literal["minimum", "standard", "aggressive"] | None = None
-    """null: counts as measured; else the camera repairs defects with this sensitivity, which alters data."""
-    exposure_tolerance: Annotated[float, Field(ge=0)] = 0.01
-    """By which fraction (and one line time) the camera may change an exposure before it is refused."""
     cool_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Wait at most so long for the sensor to be cold before a scan; 0: do not wait."""
-    ring_mb: Annotated[int, Field(gt=0, le=1_000_000)] = 1000
-    """Most memory for the ring; a full frame has 18.9 MB."""
     usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
     """USB product id, for the doctor; null: any of the vendor's (which makes other things too)."""
     usb_serial: str | None = None
     """USB serial number, for the doctor, where there are several cameras."""
+
+    @property
+    def options(self) -> DcamOptions:
+        """In the driver's terms."""
+        options: DcamOptions = read_from(self, DcamOptions)
+        return options
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
         return orca_quest.timing(wanted, self.link, self.model)
@@ -136,125 +118,21 @@ class Simple(Section):
     kind: Literal["simulated", "manual"]
 
 
-class StageOutputShutter(Section):
-    """A shutter on a digital output of the stage's controller, where that has outputs that can be set."""
-
-    kind: Literal["stage_output"]
-    output: PositiveInt
-    """Number of the output; not the one that the trigger pulses come from."""
-    open_high: bool = True
-    """A high output opens."""
-    settle_s: Annotated[float, Field(ge=0)] = 0.1
-    """How long the blade travels."""
+def _found(table: str) -> tuple[type[Section], ...]:
+    """Sections of the families of devices, by the table of their folders that has them."""
+    return tuple(in_folders("beamline.config.families", table).values())
 
 
-Pattern = Annotated[str, without(pattern_problem)]
-
-
-class EpicsShutter(Section):
-    """A shutter behind EPICS process variables, each as pva://NAME or ca://NAME."""
-
-    kind: Literal["epics"]
-    open_pv: PvUrl
-    open_value: PvValue = 1.0
-    """Written to open_pv to open it: a number, a text or a label."""
-    close_pv: PvUrl | None = None
-    """null: open_pv, which then takes both values."""
-    close_value: PvValue = 0.0
-    status_pv: PvUrl
-    """Where the blade itself is read; open_pv where there is nothing better."""
-    status_open: PvValue = 1.0
-    """Its value or label while the shutter is open; anything else is closed."""
-    timeout_s: Seconds = 2.0
-    """For an answer of the IOC."""
-    travel_s: Seconds = 10.0
-    """The longest that the status may take to follow."""
-
-    @property
-    def pvs(self) -> ShutterPvs:
-        """In the driver's terms."""
-        closing = self.close_pv or self.open_pv
-        values = self.open_value, self.close_value, self.status_open
-        return ShutterPvs(self.open_pv, closing, self.status_pv, *values, self.timeout_s, self.travel_s)
-
-
-class _BeamMonitor(Section):
-    """What every beam monitor has."""
-
-    unit: str
-    scale: PositiveFloat = 1.0
-    """What the number is multiplied by to be in `unit`."""
-    timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
-    period_s: Annotated[float, Field(gt=0, le=1e6)] = 1.0
-    """Between readings while a scan runs (real time); they are kept in the scan's file."""
-    pause_below: PositiveFloat | None = None
-    """In `unit`: a scan pauses while there is less; null: it never does."""
-    resume_above: PositiveFloat | None = None
-    """In `unit`: from here on there is beam again; null: a tenth above pause_below."""
-    settle_s: Annotated[float, Field(ge=0)] = 5.0
-    """For which there must be beam again before the scan goes on."""
-
-    @model_validator(mode="after")
-    def _resumes_where_it_would_not_pause(self) -> Self:
-        if self.pause_below is None and self.resume_above is not None:
-            raise ValueError("resume_above has no meaning without pause_below: set both, or neither")
-        if self.pause_below is not None and self.resumes_at < self.pause_below:
-            raise ValueError(f"resume_above {self.resumes_at:g} is below pause_below {self.pause_below:g}")
-        return self
-
-    @property
-    def resumes_at(self) -> float:
-        """In `unit`."""
-        return self.resume_above or 1.1 * (self.pause_below or 0.0)
-
-
-class NoBeamMonitor(Section):
-    kind: Literal["none"] = "none"
-
-
-class ElectrometerConfig(_BeamMonitor):
-    """An electrometer or picoammeter on a serial port that answers a query with a line that holds a number."""
-
-    kind: Literal["electrometer"]
-    port: Annotated[str, Field(min_length=1)]
-    """A serial port, socket://host:port, or sim://electrometer."""
-    query: Annotated[str, Field(min_length=1)] = QUERY
-    pattern: Pattern = PATTERN
-    """Regular expression whose first group is the number."""
-    unit: str = "A"
-    setup: tuple[str, ...] = ()
-    """Commands without a reply, sent once at the start."""
-    line_end: Literal["crlf", "cr", "lf"] = "crlf"
-    baudrate: PositiveInt = 9600
-    transcript: str | None = None
-    """As the stage's."""
-
-    @property
-    def simulated(self) -> bool:
-        return self.port.lower().startswith("sim://")
-
-
-class RingCurrentConfig(_BeamMonitor):
-    """The ring current from a page or a text file."""
-
-    kind: Literal["ring_current"]
-    url: Annotated[str, without(url_problem)]
-    """http://..., https://... or file:///..."""
-    pattern: Pattern
-    """Regular expression whose first group is the number."""
-    unit: str = "mA"
-
-
-class EpicsBeamConfig(_BeamMonitor):
-    """The ring current, or an intensity, from an EPICS process variable."""
-
-    kind: Literal["epics"]
-    pv: PvUrl
-    """pva://NAME or ca://NAME."""
-    unit: str = "mA"
-
-
-BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig | EpicsBeamConfig
+if TYPE_CHECKING:
+    ShutterConfig = Simple | StageOutputShutter | FoundShutter
+    FilterConfig = NoFilter | NamedFilter | MotorFilter | FoundFilter
+    MonochromatorConfig = NoMonochromator | SceneMonochromator | HandMonochromator | FoundMonochromator
+    BeamMonitorConfig = NoBeamMonitor | BeamMonitorSection
+else:
+    ShutterConfig = Union[(Simple, StageOutputShutter, *_found("SHUTTERS"))]
+    FilterConfig = Union[(NoFilter, NamedFilter, MotorFilter, *_found("FILTERS"))]
+    MonochromatorConfig = Union[(NoMonochromator, SceneMonochromator, HandMonochromator, *_found("MONOCHROMATORS"))]
+    BeamMonitorConfig = Union[(NoBeamMonitor, *_found("BEAM_MONITORS"))]
 
 
 def _simulated(device: Simple | StageMover | FilterConfig) -> bool:
@@ -264,7 +142,7 @@ def _simulated(device: Simple | StageMover | FilterConfig) -> bool:
 class DeviceSection(Section):
     stage: Annotated[StageConfig, Field(discriminator="kind")]
     camera: Annotated[CameraConfig, Field(discriminator="kind")]
-    shutter: Annotated[Simple | StageOutputShutter | EpicsShutter, Field(discriminator="kind")]
+    shutter: Annotated[ShutterConfig, Field(discriminator="kind")]
     sample_mover: Annotated[Simple | StageMover, Field(discriminator="kind")]
     filter: Annotated[FilterConfig, Field(discriminator="kind")] = NoFilter()
     monochromator: Annotated[MonochromatorConfig, Field(discriminator="kind")] = NoMonochromator()
@@ -323,6 +201,6 @@ class DeviceSection(Section):
             simulated["filter"] = _simulated(self.filter)
         if not isinstance(self.monochromator, NoMonochromator):
             simulated["monochromator"] = self.monochromator.kind == "simulated"
-        if isinstance(self.beam_monitor, ElectrometerConfig):
+        if self.beam_monitor.counterpart is not None:
             simulated["beam_monitor"] = self.beam_monitor.simulated
         return simulated

@@ -9,7 +9,7 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.config.tree import KeyPath, Tree
-from recon.base.registry import nearest
+from recon.base.registry import did_you_mean
 
 Schema = Mapping[str, Any]
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
@@ -96,7 +96,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden":
         keys = [key for branch in _at(schema, path[:-1], data) for key in branch.get("properties", {})]
-        return f"{name} is not a known key{_nearest(path[-1], keys)}; legal keys there: {', '.join(keys)}"
+        return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
     branches = _at(schema, path, data)
     choices = [str(choice) for branch in branches for choice in _choices(branch)]
     words = [_words(branch) for branch in branches if not _choices(branch)]
@@ -104,11 +104,7 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
     if kind == "missing" and (not path or not _has(_value(data, path[:-1]), path[-1])):
         return f"{name} is missing; expected {legal}"
     data = _value(data, path)
-    return f"{name} is {_shown(data)}{_nearest(data, choices)}; expected {legal}"
-
-
-def _nearest(word: Any, legal: Sequence[str]) -> str:
-    return f" (did you mean {near}?)" if (near := nearest(word, legal)) else ""
+    return f"{name} is {_shown(data)}{did_you_mean(data, choices)}; expected {legal}"
 
 
 def _value(data: Any, path: KeyPath) -> Any:

@@ -163,7 +163,8 @@ def plan_of(config: Config) -> ScanPlan:
         where = scan.angles.path if isinstance(scan.angles, FileAngles) else "scan.angles"
         raise ConfigError(f"{where}: {error}. Nothing was started.") from None
     return ScanPlan(
-        angles=theta,
+        angles=np.repeat(theta, scan.frames_per_view),
+        frames_per_view=scan.frames_per_view,
         mode=scan.mode,
         exposure=scan.exposure_s,
         period=scan.period_s,

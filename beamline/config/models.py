@@ -107,7 +107,9 @@ class ScanSection(Section):
     angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds
-    """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
+    """Time between views: sets the speed of a fly scan, the least time per frame of a step scan."""
+    frames_per_view: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has them all."""
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
     """Wait after each move of a step scan."""
     warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
@@ -232,6 +234,21 @@ class Config(Section):
         if named is not None and named not in there:
             legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has none"
             raise ValueError(f"scan.filter {named!r} is no place of the filter; {legal}")
+        return self
+
+    @model_validator(mode="after")
+    def _several_frames_are_of_a_step_scan(self) -> Self:
+        n = self.scan.frames_per_view
+        if n > 1 and self.scan.mode is Mode.FLY:
+            raise ValueError(
+                f"scan.frames_per_view {n}: each frame of a fly scan has its own angle; set scan.mode to step, or "
+                "take more views, which hold as much light"
+            )
+        if n > 1 and self.monitor.retake:
+            raise ValueError(
+                f"scan.frames_per_view {n}: a frame with an alarm is left out of its view's mean, so none is taken "
+                "again; set monitor.retake to false"
+            )
         return self
 
     @model_validator(mode="after")

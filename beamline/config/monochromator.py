@@ -1,4 +1,4 @@
-"""Configuration of the monochromator: simulated, by hand, or behind EPICS process variables."""
+"""Configuration of the monochromator: simulated, by hand, or of a family of devices."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from beamline.config.places import PvUrl, Seconds
 from beamline.config.section import Section
 from drivers.base.clock import Clock
-from drivers.epics.devices import MonochromatorPvs, PvMonochromator
+from drivers.base.protocols import ConnectedMonochromator
 
 Kev = Annotated[float, Field(gt=0, le=1e6)]
 
@@ -45,39 +44,21 @@ class HandMonochromator(_Monochromator):
     kind: Literal["manual"]
 
 
-class EpicsMonochromator(_Monochromator):
-    """A monochromator behind EPICS process variables, each as pva://NAME or ca://NAME."""
+class FoundMonochromator(_Monochromator):
+    """A monochromator of a family of devices, see `beamline.config.families`."""
 
-    kind: Literal["epics"]
-    pv: PvUrl
-    """Takes the energy."""
-    status_pv: PvUrl
-    """Where the energy itself is read."""
-    stop_pv: PvUrl | None = None
-    """Takes a 1 that stops it; null: it cannot be stopped."""
-    unit: Literal["keV", "eV"] = "keV"
-    """Of pv and status_pv."""
-    tolerance_ev: Annotated[float, Field(gt=0, le=1e4)] = 0.5
-    """Most difference of the energy from the one that was asked for."""
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """Time that it must stay within tolerance_ev before the move has ended."""
-    timeout_s: Seconds = 2.0
-    """Longest wait for an answer of the IOC."""
-    travel_s: Seconds = 60.0
-    """The longest that a move may take."""
+    kind: str
 
-    def connect(self, clock: Clock) -> PvMonochromator:
+    @property
+    def stops(self) -> bool:
+        """Whether it can be stopped."""
+        raise NotImplementedError
+
+    def connect(self, clock: Clock) -> ConnectedMonochromator:
         """The device, connected. Nothing moves. Raises DeviceError: it does not answer."""
-        pvs = MonochromatorPvs(
-            self.pv, self.status_pv, self.stop_pv, per_kev=1e3 if self.unit == "eV" else 1.0,
-            tolerance=self.tolerance_ev * 1e-3, settle=self.settle_s, timeout=self.timeout_s, travel=self.travel_s,
-        )  # fmt: skip
-        return PvMonochromator(pvs, clock)
+        raise NotImplementedError
 
     def halt(self, clock: Clock) -> None:
         """Stop it. Raises DeviceError."""
         with closing(self.connect(clock)) as connected:
             connected.stop()
-
-
-MonochromatorConfig = NoMonochromator | SceneMonochromator | HandMonochromator | EpicsMonochromator

@@ -3,34 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, ClassVar, Literal, Self
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from beamline.config.section import Section
 from beamline.config.stages import StageConfig
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
-from drivers.epics.channel import url_problem as pv_problem
-from drivers.epics.devices import FilterPvs, PvFilter
+from drivers.base.protocols import ConnectedFilter
 from drivers.places import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
 
-
-def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Refuses a text that has a problem."""
-
-    def checked(text: str) -> str:
-        if problem := problem_of(text):
-            raise ValueError(problem)
-        return text
-
-    return AfterValidator(checked)
-
-
-PvUrl = Annotated[str, without(pv_problem)]
-PvValue = float | str
-Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Name = Annotated[str, Field(min_length=1, max_length=80)]
 
 
@@ -115,7 +99,7 @@ class MotorFilter(MotorSection):
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
         self._refuse_unreachable(self.places)
-        _refuse_equal(self.places)
+        refuse_equal(self.places)
         return self
 
     def connect(self, clock: Clock, url: str | None = None) -> PlacedStage:
@@ -123,35 +107,19 @@ class MotorFilter(MotorSection):
         return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
 
 
-class EpicsFilter(Section):
-    """Filters behind EPICS process variables, each as pva://NAME or ca://NAME."""
+class FoundFilter(Section):
+    """Filters of a family of devices, see `beamline.config.families`."""
 
-    kind: Literal["epics"]
-    pv: PvUrl
-    """Takes the value of a place: a number, a text or a label."""
-    status_pv: PvUrl | None = None
-    """Where the filter itself is read, with the same values; null: pv."""
-    places: Annotated[dict[Name, PvValue], Field(min_length=1)]
-    """Name: value."""
-    timeout_s: Seconds = 2.0
-    """For an answer of the IOC."""
-    travel_s: Seconds = 30.0
-    """The longest that the status may take to follow."""
+    if TYPE_CHECKING:
+        kind: str
+        places: Mapping[str, float | str]
 
-    @model_validator(mode="after")
-    def _one_value_a_place(self) -> Self:
-        _refuse_equal(self.places)
-        return self
-
-    def connect(self, clock: Clock) -> PvFilter:
+    def connect(self, clock: Clock) -> ConnectedFilter:
         """As that of `StageMover`."""
-        status = self.status_pv or self.pv
-        return PvFilter(FilterPvs(self.pv, status, self.places, self.timeout_s, self.travel_s), clock)
+        raise NotImplementedError
 
 
-FilterConfig = NoFilter | NamedFilter | MotorFilter | EpicsFilter
-
-
-def _refuse_equal(places: Mapping[str, float | str]) -> None:
+def refuse_equal(places: Mapping[str, float | str]) -> None:
+    """Raises ValueError: two places have one value."""
     if len(set(places.values())) < len(places):
         raise ValueError("places: two have one value, so that nobody could tell them apart")

@@ -5,17 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from beamline.config.devices import (
-    DeviceSection,
-    ElectrometerConfig,
-    NoBeamMonitor,
-    SimulatedOrca,
-    StageOutputShutter,
-)
+from beamline.config.beam import NoBeamMonitor
+from beamline.config.devices import DeviceSection, SimulatedOrca
 from beamline.config.models import Config
 from beamline.config.monochromator import NoMonochromator
 from beamline.config.places import MotorSection, NoFilter
 from beamline.config.section import Section
+from beamline.config.shutters import StageOutputShutter
 from beamline.config.stages import StageSection
 from drivers.orca_quest import SENSOR_SHAPE
 
@@ -110,7 +106,8 @@ def _monochromator(real: DeviceSection) -> dict[str, Any]:
 
 
 def _beam_monitor(real: DeviceSection) -> dict[str, Any]:
-    """The simulated electrometer shows a steady current, which says nothing of the limits of the real one."""
-    if not isinstance(real.beam_monitor, ElectrometerConfig):
+    """The simulated one shows a steady intensity, which says nothing of the limits of the real one."""
+    monitor = real.beam_monitor
+    if monitor.counterpart is None:
         return _plain(NoBeamMonitor())
-    return _plain(real.beam_monitor) | {"port": "sim://electrometer", "pause_below": None, "resume_above": None}
+    return _plain(monitor) | {"port": f"sim://{monitor.counterpart}", "pause_below": None, "resume_above": None}

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
 
-from drivers.flat import FlatField, flat_fields, from_flat
-from drivers.stages.settings import ANGULAR, Key
+from drivers.flat import FlatField, Key, flat_fields, from_flat
+
+
+def without(problem_of: Callable[[str], str]) -> AfterValidator:
+    """Refuses a text that has a problem."""
+
+    def checked(text: str) -> str:
+        if problem := problem_of(text):
+            raise ValueError(problem)
+        return text
+
+    return AfterValidator(checked)
 
 
 class Section(BaseModel):
@@ -57,22 +66,27 @@ def _name(field: FlatField) -> str:
 
 
 def _inside(field: FlatField, value: Any) -> Any:
-    """A key's value for the driver: radians, and the type of the field."""
-    if value is None:
-        return None
-    if _key(field).unit in ANGULAR:
-        return math.radians(value)
-    return field.plain(value) if issubclass(field.plain, StrEnum | Path) else value
+    """A key's value for the driver, in the unit and of the type of the field."""
+    if value is None or _key(field).converted:
+        return _key(field).inside(value)
+    return field.plain(value) if _is(field.plain, StrEnum, Path) else value
+
+
+def _is(plain: Any, *kinds: type[Any]) -> bool:
+    """Whether it is a class of one of these kinds, and not a union."""
+    return isinstance(plain, type) and issubclass(plain, kinds)
 
 
 def _declared(field: FlatField) -> tuple[Any, Any]:
     """Type and default of a field's key, as pydantic takes them."""
     key, plain = _key(field), field.plain
     legal: Any = plain
-    if issubclass(plain, StrEnum):
+    if _is(plain, StrEnum):
         legal = Literal[tuple(choice.value for choice in plain)]
-    elif issubclass(plain, Path):
+    elif _is(plain, Path):
         legal = str
+    if key.problem is not None:
+        legal = Annotated[legal, without(key.problem)]
     if key.bounds:
         legal = Annotated[legal, Field(**key.bounds)]
     if field.optional:
@@ -80,7 +94,7 @@ def _declared(field: FlatField) -> tuple[Any, Any]:
     default = field.default
     if default is MISSING:
         default = ...
-    elif key.unit in ANGULAR:
+    elif key.converted:
         default = key.default
     elif isinstance(default, StrEnum):
         default = default.value

@@ -116,4 +116,5 @@ STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind) for kin
 if TYPE_CHECKING:
     StageConfig = StageSection
 else:
-    StageConfig = Union[tuple(STAGE_SECTIONS.values())]  # noqa: UP007 - a union of as many as there are
+    _NONE = section_of("NoStageConfig", StageSection, {"kind": (Literal["a stage that is installed"], ...)})
+    StageConfig = Union[tuple(STAGE_SECTIONS.values()) or _NONE]  # noqa: UP007 - a union of as many as there are

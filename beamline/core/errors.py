@@ -8,8 +8,10 @@ import re
 import sys
 import tempfile
 import traceback
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from beamline.core.shipped import version
 from beamline.core.text import size
@@ -62,6 +64,20 @@ class AlarmError(BeamlineError):
     """Finished and written, but the monitor raised alarms: some frames are bad."""
 
     exit_code = 7
+
+
+def refuse_wrong_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
+    """Raise ConfigError for an argument of another type than the function declares.
+
+    Args:
+        values: by name, such as `locals()` in the function's first line.
+    """
+    from recon.base.declared_types import check_arguments  # here, because most commands need none of it
+
+    try:
+        check_arguments(function, values)
+    except ValueError as error:
+        raise ConfigError(f"{error}. Nothing was started.") from error
 
 
 INTERRUPTED = 130

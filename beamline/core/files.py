@@ -9,6 +9,7 @@ import os
 import platform
 import shutil
 import stat
+import sys
 import uuid
 import zlib
 from collections.abc import Iterator
@@ -54,7 +55,7 @@ _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems 
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
-_STEP_BY_STEP = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")  # not on Windows
+STEP_BY_STEP = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")  # not on Windows
 _JUNCTION = 0xA0000003  # st_reparse_tag of a mount point of Windows
 SETTINGS = 2**20  # Most bytes of a text file of settings: YAML of 1 MB takes seconds to read
 
@@ -125,7 +126,7 @@ def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
     A caller reads at most `largest` bytes, as the file may grow.
     """
     place = require_below(folder, name, largest)
-    if not _STEP_BY_STEP:
+    if sys.platform == "win32" or not STEP_BY_STEP:
         return place.open("rb")
     *within, last = PurePosixPath(name).parts
     at = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -316,20 +317,3 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-@contextmanager
-def result_folder(folder: Path) -> Iterator[Path]:
-    """Make the folder of a result, and a temporary folder in it, which is removed at the end of the block.
-
-    An empty result folder is removed, too, because the next run would refuse it.
-    """
-    folder.mkdir()
-    work = folder / "work"
-    work.mkdir()
-    try:
-        yield work
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()

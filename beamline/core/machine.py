@@ -17,9 +17,9 @@ from beamline.core.text import count
 if sys.platform != "win32":
     import resource
 
-_CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-# Of a control group: its line in _OWN_CGROUP, its tree, the files of its limit and of its use. In memory.stat: the file
+_CPUINFO, STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
+CGROUPS, OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+# Of a control group: its line in OWN_CGROUP, its tree, the files of its limit and of its use. In memory.stat: the file
 # cache that counts as used and is given up first.
 _CGROUP_2 = (r"0::/(.*)", "", "memory.max", "memory.current", "inactive_file")
 _CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
@@ -52,12 +52,14 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
 
 def usable_cores() -> int:
     """Cores that this process may use."""
+    if sys.platform == "darwin":
+        return psutil.cpu_count() or 1  # macOS binds no process to cores
     return len(psutil.Process().cpu_affinity())
 
 
 def free_memory() -> int:
     """Bytes that can be had without swapping, also within a container's limit and that of `memory_limit`."""
-    free = [int(psutil.virtual_memory().available), *_left_in_cgroups(_CGROUPS, _OWN_CGROUP)]
+    free = [int(psutil.virtual_memory().available), *_left_in_cgroups(CGROUPS, OWN_CGROUP)]
     if (limit := memory_limit()) is not None:
         free.append(max(limit - int(psutil.Process().memory_info().vms), 0))
     return min(free)
@@ -65,19 +67,19 @@ def free_memory() -> int:
 
 def memory_limit() -> int | None:
     """Bytes of addresses that this process may take (ulimit -v); None without a limit, and on Windows."""
-    if sys.platform == "win32":
-        return None
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return None if limit == resource.RLIM_INFINITY else limit
+    if sys.platform != "win32":
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        return None if limit == resource.RLIM_INFINITY else limit
+    return None
 
 
 def peak_memory() -> int | None:
     """Largest resident set of this process so far, in bytes; None if the system does not tell."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
-    if _STATUS.is_file():
+    if STATUS.is_file():
         # Linux lets a new process inherit ru_maxrss of the one that started it; VmHWM is its own.
-        return _entry(_STATUS, "VmHWM:") * 1024 or None
+        return _entry(STATUS, "VmHWM:") * 1024 or None
     return None
 
 

@@ -21,7 +21,7 @@ from beamline.core.errors import INTERRUPTED
 from beamline.core.stop import StopScope
 
 _POLL = 0.2  # real s between two questions whether the process should stop
-_FROZEN = 4.0  # real s without output or processor time, after which a process that was asked to end is killed
+FROZEN_AFTER = 4.0  # real s without output or processor time, after which a process that was asked to end is killed
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
 ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
@@ -122,7 +122,7 @@ class ChildProcess:
             hurry: polled in the same way while the process ends; True kills it at once.
             seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
-            grace: real s between the request to end and the kill; 0 kills at once. One that is frozen has _FROZEN.
+            grace: real s between the request to end and the kill; 0 kills at once. One that is frozen has FROZEN_AFTER.
         """
         self._silent_since = time.monotonic()
         ending, deadline = Ending.EXITED, self._silent_since + seconds
@@ -168,7 +168,7 @@ class ChildProcess:
             self._process.terminate()
             work, since = self._work(), time.monotonic()
             deadline = since + grace
-            while (left := min(deadline, since + _FROZEN) - time.monotonic()) > 0 and not hurry():
+            while (left := min(deadline, since + FROZEN_AFTER) - time.monotonic()) > 0 and not hurry():
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(min(_POLL, left))
                     return

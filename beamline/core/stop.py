@@ -205,10 +205,11 @@ class StopRequest:
         stopping: a stop or an abort was requested.
         aborting: an abort was.
         reason: of the first stop, or of the last abort.
+        by_person: somebody asked, or the system, and not only the scan itself.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self.stopping = self.aborting = self._enough = False
+        self.stopping = self.aborting = self.by_person = self._enough = False
         self.reason, self._now, self._requested_at = "", now, 0.0
 
     def refuse_abort(self) -> None:
@@ -216,8 +217,13 @@ class StopRequest:
         if self.aborting:
             raise ScanAborted(f"Aborted: {self.reason}.")
 
-    def stop(self, reason: str = "the operator asked for it") -> None:
-        """End cleanly: pending frames and missing references are still acquired, the stage returns."""
+    def stop(self, reason: str = "the operator asked for it", *, by_itself: bool = False) -> None:
+        """End cleanly: pending frames and missing references are still acquired, the stage returns.
+
+        Args:
+            by_itself: the scan asks, by what its frames show.
+        """
+        self.by_person = self.by_person or not by_itself
         self.reason = self.reason or reason
         self._requested_at = self._requested_at or self._now()
         self.stopping = True
@@ -225,11 +231,11 @@ class StopRequest:
     def stop_as_enough(self, reason: str) -> None:
         """As `stop`, but without hurry: the frames so far serve their purpose."""
         self._enough = not self.stopping
-        self.stop(reason)
+        self.stop(reason, by_itself=True)
 
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
-        self.reason = reason
+        self.reason, self.by_person = reason, True
         self._requested_at = self._requested_at or self._now()
         self.aborting = True
         self.stopping = True

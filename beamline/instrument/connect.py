@@ -10,32 +10,27 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
+from importlib import import_module
 from typing import TYPE_CHECKING, Self
 
 import click
 
-from beamline.config.devices import (
-    DcamOrca,
-    ElectrometerConfig,
-    EpicsBeamConfig,
-    EpicsShutter,
-    NoBeamMonitor,
-    RingCurrentConfig,
-    SimulatedOrca,
-    StageOutputShutter,
-)
+from beamline.config.beam import BeamMonitorSection
+from beamline.config.devices import DcamOrca, SimulatedOrca
 from beamline.config.load import Config, camera_settings
-from beamline.config.monochromator import EpicsMonochromator, NoMonochromator
-from beamline.config.places import EpicsFilter, MotorFilter, NoFilter, StageMover
+from beamline.config.monochromator import FoundMonochromator, NoMonochromator
+from beamline.config.places import FoundFilter, MotorFilter, NoFilter, StageMover
+from beamline.config.shutters import FoundShutter, StageOutputShutter
 from beamline.core.errors import ConfigError
 from beamline.instrument.operator import ask_operator
-from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_devices, simulated_electrometer
+from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_beam_monitor, simulated_devices
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (
     BeamMonitor,
     Camera,
     CameraTiming,
+    ConnectedShutter,
+    CooledCamera,
     Devices,
     Filter,
     Monochromator,
@@ -45,34 +40,28 @@ from drivers.base.protocols import (
     TriggerSource,
     Watchable,
 )
-from drivers.beam_monitors.reading import ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor, TextSource
-from drivers.epics.devices import PvShutter, PvSource
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 
 if TYPE_CHECKING:
-    from drivers.dcam.camera import DcamCamera
-    from drivers.dcam.options import DcamOptions
     from recon.base.volume import Grid, Volume
 
 TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
 
 
-def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
+def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> CooledCamera:
     """The driver of the configured camera, connected. `memory`: of the frames that it gives.
 
     Raises:
         DeviceError: no library, no camera, or it does not count its frames.
     """
-    from drivers.dcam.camera import DcamCamera
-
-    library = None if config.library is None else Path(config.library)
-    return DcamCamera(library, config.index, clock=clock, options=options_of(config), memory=memory)
+    camera: CooledCamera = import_module(f"drivers.{config.kind}.camera").configured(config, clock, memory)
+    return camera
 
 
-def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop: Callable[[], None]) -> None:
+def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_stop: Callable[[], None]) -> None:
     """Wait for a cold sensor and tell the operator how cold it is.
 
     Args:
@@ -95,46 +84,14 @@ def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop
     camera.wait_until_cold(seconds, progress)
 
 
-def options_of(camera: DcamOrca) -> DcamOptions:
-    """The configuration in the driver's terms."""
-    from drivers.dcam import options
-
-    return options.DcamOptions(
-        trigger_active=options.TriggerActive(camera.trigger_active),
-        trigger_mode=options.TriggerMode(camera.trigger_mode),
-        trigger_polarity=options.TriggerPolarity(camera.trigger_polarity),
-        global_exposure=options.GlobalExposure(camera.global_exposure),
-        trigger_times=camera.trigger_times,
-        trigger_delay=camera.trigger_delay_s,
-        hot_pixels=None if camera.hot_pixels is None else options.HotPixelMode(camera.hot_pixels),
-        exposure_tolerance=camera.exposure_tolerance,
-        ring_bytes=camera.ring_mb * 1_000_000,
-    )
-
-
-def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig | EpicsBeamConfig, clock: Clock) -> BeamMonitor:
-    """The beam monitor that is configured; the simulated electrometer shows a steady current.
+def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
+    """The beam monitor that is configured; a simulated one shows a steady intensity.
 
     Raises:
-        DeviceError: the electrometer's port does not open.
+        DeviceError: its port does not open.
     """
-    source: TextSource
-    pattern = "(.*)" if isinstance(config, EpicsBeamConfig) else config.pattern
-    if isinstance(config, EpicsBeamConfig):
-        source = PvSource(config.pv, config.timeout_s)
-    elif isinstance(config, RingCurrentConfig):
-        source = PageSource(config.url, clock, timeout=config.timeout_s)
-    else:
-        end = {"crlf": b"\r\n", "cr": b"\r", "lf": b"\n"}[config.line_end]
-        source = SerialSource(
-            simulated_electrometer(clock, end) if config.simulated else config.port,
-            clock,
-            ElectrometerQuery(config.query, config.pattern, config.setup, end),
-            timeout=config.timeout_s,
-            baudrate=config.baudrate,
-            transcript=None if config.transcript is None else Path(config.transcript),
-        )
-    return TextBeamMonitor(source, clock, pattern=pattern, unit=config.unit, scale=config.scale)
+    name = config.counterpart if config.simulated else None
+    return config.connect(clock, None if name is None else simulated_beam_monitor(name, config, clock))
 
 
 @dataclass(frozen=True)
@@ -202,8 +159,8 @@ def connect(
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
-        if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
-            monitor = make_beam_monitor(config.devices.beam_monitor, clock)
+        if isinstance(wanted := config.devices.beam_monitor, BeamMonitorSection):
+            monitor = make_beam_monitor(wanted, clock)
             opened.callback(monitor.close)
 
         def watch(check: Callable[[], None]) -> None:
@@ -266,14 +223,14 @@ def _instrument(
         camera = chosen.connect(clock)
         opened.callback(camera.close)
     shutter = shutter_of(config, stage, clock, ask)
-    if isinstance(shutter, PvShutter):
+    if isinstance(shutter, ConnectedShutter):
         opened.callback(shutter.disconnect)
     return Devices(stage, camera, shutter, ManualSampleMover(ask))
 
 
 def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
     wanted = config.devices.filter
-    if isinstance(wanted, MotorFilter | EpicsFilter):
+    if isinstance(wanted, MotorFilter | FoundFilter):
         connected = wanted.connect(clock)
         opened.callback(connected.close)
         return connected
@@ -282,7 +239,7 @@ def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter
 
 def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
     wanted = config.devices.monochromator
-    if isinstance(wanted, EpicsMonochromator):
+    if isinstance(wanted, FoundMonochromator):
         connected = wanted.connect(clock)
         opened.callback(connected.close)
         return connected
@@ -292,8 +249,8 @@ def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) ->
 def shutter_of(config: Config, stage: RotationStage, clock: Clock, ask: Ask) -> Shutter:
     """The configured shutter of a real instrument."""
     wanted = config.devices.shutter
-    if isinstance(wanted, EpicsShutter):
-        return PvShutter(wanted.pvs, clock)
+    if isinstance(wanted, FoundShutter):
+        return wanted.connect(clock)
     if not isinstance(wanted, StageOutputShutter):
         return ManualShutter(ask)
     output = stage.digital_output(wanted.output)

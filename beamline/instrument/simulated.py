@@ -9,14 +9,17 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.devices import SimulatedOrca, StageOutputShutter
+from beamline.config.beam import BeamMonitorSection
+from beamline.config.devices import SimulatedOrca
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
 from beamline.config.monochromator import SceneMonochromator
 from beamline.config.places import MotorFilter, NoFilter, StageMover
+from beamline.config.shutters import StageOutputShutter
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
@@ -24,6 +27,7 @@ from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
 from drivers.manual import ManualFilter
 from drivers.shutter import OutputShutter
+from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
@@ -129,7 +133,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     Raises:
         ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
     """
-    from beamline.simulate.scene_file import volumes_beside
+    from beamline.simulate.volumes import volumes_beside
     from simulators.frame.mapping import SceneError
     from simulators.scenes.scene import load_scene
 
@@ -207,9 +211,10 @@ def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
     return truth
 
 
-def simulated_electrometer(clock: Clock, end: bytes) -> str:
-    """The url of an electrometer that shows a steady current; its lines end with `end`."""
-    from simulators.wires.electrometer import ElectrometerWire
+def simulated_beam_monitor(name: str, config: BeamMonitorSection, clock: Clock) -> str:
+    """The url of the simulated counterpart with this name, which shows a steady intensity."""
     from simulators.wires.serial_url import register
 
-    return register(f"electrometer-{uuid4().hex}", ElectrometerWire(clock, end=end))
+    modules = in_folders("simulators.wires", "BEAM_MONITORS")
+    wire = import_module(modules[name]).matching(config, clock)
+    return register(f"{name}-{uuid4().hex}", wire)

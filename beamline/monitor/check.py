@@ -45,6 +45,7 @@ class ScanContext:
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
         step: rad from a view to the next, as planned: the median, with its sign; NaN: not known, or they do not turn
             one way.
+        frames_per_view: at each angle; only the first of a view is compared with views before.
         stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
@@ -60,7 +61,7 @@ class ScanContext:
             `step` is not known.
         light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
             projection.
-        view: the frame on this grid; None where it is no projection, or has no light.
+        view: the frame on this grid; None where it is no projection, or has no light, or is not its view's first.
         truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
         dimmer: logarithm of the light that the beam has lost since the flats, as air beside the sample shows it; NaN
             where none has shown it yet.
@@ -74,6 +75,7 @@ class ScanContext:
     pixels: int
     period: float | None = None
     step: float = math.nan
+    frames_per_view: int = 1
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None

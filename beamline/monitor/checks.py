@@ -1,7 +1,7 @@
 """The registry of the monitor's checks, and their bits in a file: those of a frame say which checks flagged it.
 
-Adding a check takes its file in this folder and its line in REGISTRY. Its keys in the configuration, its bits and the
-legend in a scan file, and its name in `beamline info` follow.
+Adding a check takes its file in this folder and its line in REGISTRY, or in CHECKS of a folder of checks. Its keys in
+the configuration, its bits and the legend in a scan file, and its name in `beamline info` follow.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import fields
 from importlib import import_module
 
 from beamline.monitor.check import Check, Flag, Level
-from recon.base.registry import Registry
+from recon.base.registry import Registry, in_folders
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
 BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one first
@@ -22,22 +22,19 @@ REGISTRY = {  # module in this folder: class of the check
     "beam": "BeamCheck",
     "saturation": "SaturationCheck",
     "stuck": "StuckCheck",
-    "bands": "BandsCheck",
     "timing": "TimingCheck",
     "mass": "MassCheck",
     "dark": "DarkCheck",
     "lost": "LostCheck",
-    "gain": "GainCheck",
     "motion": "MotionCheck",
-    "floater": "FloaterCheck",
-    "ghost": "GhostCheck",
     "pixels": "PixelsCheck",
     "field": "FieldOfViewCheck",
-    "blur": "BlurCheck",
-    "zingers": "ZingersCheck",
     "opposite": "OppositeCheck",
-    "model": "ModelCheck",
 }
+
+
+def _bit(check: Check) -> int:
+    return check.bit
 
 
 def _distinct(*checks: Check) -> tuple[Check, ...]:
@@ -65,10 +62,12 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
     return Registry("check", {check.name: check for check in ours}, made)
 
 
-_OURS = _distinct(*(getattr(import_module(f"beamline.monitor.{module}"), name)() for module, name in REGISTRY.items()))
+_MODULES = {f"beamline.monitor.{module}": name for module, name in REGISTRY.items()}
+_CLASSES = {**_MODULES, **in_folders("beamline.monitor", "CHECKS")}
+_OURS = _distinct(*sorted((getattr(import_module(module), name)() for module, name in _CLASSES.items()), key=_bit))
 BY_NAME = _all(_OURS)
 CHECKS: tuple[Check, ...] = tuple(BY_NAME.values())
-"""All checks with their default limits, in the order in which they look at a frame."""
+"""All checks with their default limits, in the order of their bits, in which they look at a frame."""
 
 _BITS = {check.name: check.bit for check in CHECKS}
 

@@ -28,6 +28,8 @@ UNLIT = 0.05  # share of the bright part's light: a place with less counts as da
 CHANGE_SIGMAS = 8.0  # standard deviations: a larger change between two flats is not noise
 LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
 ZINGER = 12.0  # times the median change: more is not noise
+BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
+CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
 WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
 
 
@@ -72,6 +74,9 @@ class ReferenceFrame:
         rounding: noise that the pixels' type may hide; 0 of real numbers.
         invalid: fraction of the pixels that are not finite.
         cells: float32, means of larger blocks that cover the frame; None: not needed.
+        largest: the largest count that more than BY_CHANCE pixels hold; at_largest: fraction of the pixels that hold
+            it, less those, or, where other pixels have more, less those that hold one count less. NaN and 0 where
+            nobody looked.
     """
 
     row: int
@@ -83,6 +88,8 @@ class ReferenceFrame:
     rounding: float = LEAST_NOISE
     invalid: float = 0.0
     cells: NDArray[np.float32] | None = None
+    largest: float = np.nan
+    at_largest: float = 0.0
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
@@ -217,10 +224,31 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score = float(np.median([flat.saturated for flat in flats])) - hot
     if score <= limits.saturated:
-        return None
+        return _clipped(flats, darks, limits)
     sentence = (
         f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
         "Shorten the exposure or add a filter."
+    )
+    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
+
+
+def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
+    """Flats whose counts end below the end of their type. Where pixels vary from frame to frame, few share the largest
+    count, and it is not the same in all frames; hot pixels and zingers, which are few, have more."""
+    hot = [dark.at_largest for dark in darks or () if dark.largest == flats[0].largest]
+    score = float(np.median([flat.at_largest for flat in flats])) - max(hot, default=0.0)
+    if len(flats) < 2 or score <= limits.saturated or len({flat.largest for flat in flats}) > 1:
+        return None
+    blocks = np.stack([flat.blocks for flat in flats])
+    change = np.abs(np.diff(blocks, axis=0))
+    varied = change[change > 0]  # blocks at the end of the counts do not; a few that differ are damage
+    noise = median_deviation(varied) / 2**0.5 * flats[0].block if varied.size > BY_CHANCE else 0.0
+    if not CLIPPED_NOISE <= noise <= limits.uneven * flats[0].largest:  # one that is damaged or moved varies by more
+        return None
+    sentence = (
+        f"{score:.2%} of their pixels hold {flats[0].largest:g}, the largest count but for a few, though pixels vary "
+        f"by {noise:.3g} from frame to frame (limit {limits.saturated:.2%}): counts end there, and the light is not "
+        "known. Shorten the exposure, or look for what cut the counts off."
     )
     return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
 

@@ -31,9 +31,12 @@ from drivers.base.frame import Frame, FrameKind
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
 FORGET = 0.99  # a view: matter at the edge a quarter of a turn ago may come back
 NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a view to its neighbour
+SAME, SAME_ANGLE = 0.1, math.radians(0.02)  # planned steps, or rad where they are not known, within a view
 ONE_WAY = 0.75  # of the steps, which golden angles have not: 0.62
 EVERY, MOST = math.radians(5), 72  # between the views that are kept for others near them that come later; number
 DARK = 0.5  # least light left of a view; with less it is skipped, see the check `lost`
+
+FLOODED = 0.1  # of the pixels more saturated than in the last good view: nine tenths of the places tell the light
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,7 @@ class Monitor:
         cut: usual line integral at the worse edge of the field, over the views so far.
         light: of the beam, over the views so far.
         shake: of the sample, likewise.
+        saturated: fraction of the pixels of the last good view; 1 before any.
     """
 
     context: ScanContext
@@ -64,6 +68,7 @@ class Monitor:
     cut: float = 0.0
     light: LightOverScan = field(default_factory=LightOverScan)
     shake: Shake = field(default_factory=Shake)
+    saturated: float = 1.0
 
     def drift(self) -> str:
         """What became of the beam's light over the scan, in words; "" where it stayed within the limit of `beam`."""
@@ -200,14 +205,17 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     view = view_of(digest.preview, grid, frame.index, frame.angle, longer)
     recent, last = monitor.recent, monitor.recent[-1] if monitor.recent else None
     steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step
+    if last is not None and context.frames_per_view > 1 and _of_one_view(view.angle - last.angle, context.step):
+        # It shows what the first frame of its view showed.
+        return replace(monitor, context=replace(context, grid=grid, light_left=light_left(view, last, grid)))
     follows = math.isnan(steps) or NEAREST < steps < FARTHEST
     if not follows:  # the view for comparison must be its neighbour in angle
         recent, last = (), _nearest(view.angle, monitor.kept)
         context = replace(context, spots=spots._replace(n=0))
     left = light_left(view, last, grid)
     context = replace(context, grid=grid, light_left=left, follows=follows)
-    if left < DARK:
-        return replace(monitor, context=context)
+    if left < DARK or digest.saturated_fraction > monitor.saturated + FLOODED:
+        return replace(monitor, context=context)  # no measure for the views after it
     change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
     recent = (*recent, view)[-SPAN:]
@@ -220,7 +228,15 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     cut = max(*at_edges(context), FORGET * monitor.cut)
     context = replace(context, truncated=not grid.flats or cut > AIR)
     light = monitor.light.with_view(frame.index, in_air(context))
-    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, light=light, shake=shake)
+    saturated = digest.saturated_fraction
+    return replace(
+        monitor, context=context, recent=recent, kept=kept, cut=cut, light=light, shake=shake, saturated=saturated
+    )
+
+
+def _of_one_view(apart: float, step: float) -> bool:
+    """Frames so many radians apart are of one view."""
+    return abs(math.remainder(apart, 2 * math.pi)) < (SAME_ANGLE if math.isnan(step) else SAME * abs(step))
 
 
 def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:
@@ -245,7 +261,7 @@ _SIDE, _BIN = 256, 8  # pixels of a toy frame, and of a pixel of its preview, wh
 _DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts
 _SATURATION, _STEP = 65_535, 0.02  # counts; rad from view to view
 _BEFORE_GHOST = 36  # views
-_REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
+REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
 
 
 def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None) -> None:
@@ -255,7 +271,7 @@ def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None)
     for the next scan of the process with the same checks. A check that fails here will say so in the scan.
     """
     checks = repr(monitor.checks)
-    if checks in _REHEARSED:
+    if checks in REHEARSED:
         return
     # A scan of its own: the views of another step would not be neighbours, and the kernels that compare them not run.
     toy = start(ScanContext(_SATURATION, _SIDE**2, period=0.1, step=_STEP), monitor.checks)
@@ -274,4 +290,4 @@ def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None)
         frame = Frame(counts, kind, row, row, row, _STEP * row, 1.8e9 + row, 0.1)
         with suppress(CheckError):
             toy, _ = look(toy, frame, digests(counts, _SATURATION, _BIN)[0], begin)
-    _REHEARSED.add(checks)
+    REHEARSED.add(checks)

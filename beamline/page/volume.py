@@ -25,8 +25,8 @@ from beamline.storage.writers.recon_file import opened_reconstruction
 F32 = NDArray[np.float32]
 HELD = 2**29
 """Bytes of the copy of a volume: all of it, or every n-th slice, binned by n."""
-_AT_ONCE = 2**26  # bytes of a volume that are read before the first picture
-_READ = 2**28  # bytes of a file with scales that are read for one slice, at most
+FIRST_READ_BYTES = 2**26  # bytes of a volume that are read before the first picture
+SLICE_READ_BYTES = 2**28  # bytes of a file with scales that are read for one slice, at most
 _SAMPLE = 2_000_000  # values that show the histogram as well as all do
 _Piece = tuple[NDArray[Any], TileRegion, int]
 
@@ -60,7 +60,7 @@ def slices_of(path: Path, values: Any, held: int) -> VolumeSlices:
 
 
 class ScaledSlices:
-    """Of a file with scales: the one that a tile needs, or a coarser one where that takes reading more than `_READ`."""
+    """Of a file with scales: the one that a tile needs, or a coarser one where that reads over `SLICE_READ_BYTES`."""
 
     bin, ready = 1, 1.0
 
@@ -82,7 +82,7 @@ class ScaledSlices:
             for i, edges in zip(sides, shown.slices, strict=True):
                 first[i] = min(edges.start // bin_, scale.shape[i] - 1)
                 end[i] = min(-(-edges.stop // bin_), scale.shape[i])
-            if _bytes_read(scale, axis, first, end) <= _READ:
+            if _bytes_read(scale, axis, first, end) <= SLICE_READ_BYTES:
                 break
         rows, cols = ((first[i] * bin_, end[i] * bin_) for i in sides)
         return scale.box(_place(first), _place(end)).squeeze(axis), TileRegion(*rows, *cols), bin_
@@ -105,7 +105,7 @@ class CopiedSlices:
         self._filled = np.zeros(shape[0], bool)
         spread = sorted(range(shape[0]), key=lambda z: -(z & -z or 2 * shape[0]))  # 0, the halves, the quarters ...
         self._waiting = iter(spread)
-        for _ in range(max(1, _AT_ONCE // (4 * math.prod(values.shape[1:])))):
+        for _ in range(max(1, FIRST_READ_BYTES // (4 * math.prod(values.shape[1:])))):
             self.read_more()
 
     @property

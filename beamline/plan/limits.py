@@ -92,9 +92,9 @@ def remarks(facts: PlanFacts) -> Iterator[str]:
             "row; turn slower, or read fewer rows"
         )
     criterion = math.ceil(math.pi / 2 * camera.shape[1])
-    if plan.angles.size < criterion:
+    if plan.n_views < criterion:
         yield (
-            f"{plan.angles.size} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
+            f"{plan.n_views} views are fewer than pi/2 x {camera.shape[1]} columns = {criterion}: "
             "filtered back-projection will show streaks towards the edge"
         )
     if plan.retakes:

@@ -40,7 +40,7 @@ class ScanPlan:
     """The requested scan.
 
     Attributes:
-        angles: float64 [view] radians, in the order of acquisition.
+        angles: float64 [frame] radians, in the order of acquisition; `frames_per_view` at each.
         mode: FLY (pulses from the moving stage) or STEP (move, settle, expose).
         exposure: s per view.
         period: s between views of a fly scan (sets the speed); for a step scan the least time per view.
@@ -55,6 +55,7 @@ class ScanPlan:
         return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
         filter: the place of the filter for all frames; None: as it stands.
         energy: keV of the monochromator for all frames; None: as it stands.
+        frames_per_view: of a step scan; the stage neither moves nor settles between them.
     """
 
     angles: NDArray[np.float64]
@@ -72,6 +73,12 @@ class ScanPlan:
     return_views: int = 0
     filter: str | None = None
     energy: float | None = None
+    frames_per_view: int = 1
+
+    @property
+    def n_views(self) -> int:
+        """Views, each of `frames_per_view` frames."""
+        return int(self.angles.size) // self.frames_per_view
 
     @property
     def retakes(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -48,20 +48,12 @@ def work_out(
         free_bytes: of the disk; None leaves it unchecked.
     """
     scale = Scale.of(to_counts)
-    broken: list[str] = []
-    flight: Flight | None = None
-    if plan.mode is Mode.FLY:
-        try:
-            flight = plan_flight(plan.angles, to_counts)
-        except ValueError as error:
-            broken.append(str(error))
+    flight, broken = _flight(plan, to_counts)
     blocks = tuple(_blocks(plan, flight, scale, stage, camera))
     views = next(block for block in blocks if block.kind is FrameKind.PROJECTION)
     speed = views.speed * _half_width(camera, axis_col)
-    frame_bytes = camera.shape[0] * camera.shape[1] * BYTES_PER_PIXEL
-    preview_bytes = math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
-    retake_seconds = _retake_seconds(plan, views, stage, camera)
-    row_bytes = frame_bytes + preview_bytes
+    frame_bytes = math.prod(camera.shape) * BYTES_PER_PIXEL
+    row_bytes = frame_bytes + math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
     facts = PlanFacts(
         plan=plan,
         views=views,
@@ -74,29 +66,42 @@ def work_out(
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
         total_bytes=row_bytes * sum(block.left for block in blocks),
         retake_bytes=row_bytes * plan.retakes,
-        retake_seconds=retake_seconds,
+        retake_seconds=_retake_seconds(plan, views, stage, camera),
         free_bytes=free_bytes,
     )
-    step_counts = flight.interval if flight else 0
-    last = next((block for block in blocks if block.kind is FrameKind.ALIGNMENT and block.left), views)
-    seconds = sum(block_seconds(block, stage, camera, plan.settle, _start(block, views)) for block in blocks)
-    seconds += _return(last, stage)
     return Timeline(
         blocks=blocks,
-        duration=seconds + plan.warm_up * _openings(blocks),
+        duration=_duration(plan, blocks, views, stage, camera),
         frame_bytes=frame_bytes,
         total_bytes=facts.total_bytes,
-        step_counts=step_counts,
-        step=step_counts * abs(scale.per_count),
+        step_counts=flight.interval if flight else 0,
+        step=flight.interval * abs(scale.per_count) if flight else 0.0,
         blur_px=facts.blur_px,
         skew_px=facts.skew_px,
         violations=(*broken, *violations(facts)),
         remarks=tuple(remarks(facts)),
-        retake_seconds=retake_seconds,
+        retake_seconds=facts.retake_seconds,
         warm_up=plan.warm_up,
         filter=plan.filter,
         energy=plan.energy,
     )
+
+
+def _flight(plan: ScanPlan, to_counts: Callable[[float], int]) -> tuple[Flight | None, list[str]]:
+    """The flight of a fly scan, or why it cannot be flown; None and no reason for a step scan."""
+    if plan.mode is not Mode.FLY:
+        return None, []
+    try:
+        return plan_flight(plan.angles, to_counts), []
+    except ValueError as error:
+        return None, [str(error)]
+
+
+def _duration(plan: ScanPlan, blocks: Sequence[Block], views: Block, stage: StageLimits, camera: CameraTiming) -> float:
+    """Seconds of all blocks, of the way back to zero, and of the shutter's openings."""
+    last = next((block for block in blocks if block.kind is FrameKind.ALIGNMENT and block.left), views)
+    seconds = sum(block_seconds(block, stage, camera, plan.settle, _start(block, views)) for block in blocks)
+    return seconds + _return(last, stage) + plan.warm_up * _openings(blocks)
 
 
 def _openings(blocks: Iterable[Block]) -> int:
@@ -172,7 +177,8 @@ def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle
             at = flown.end
         return seconds + tail
     for i, angle in enumerate(np.delete(block.angles, list(block.stored)).tolist()):
-        ready = move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
+        stands = bool(i) and angle == at
+        ready = 0.0 if stands else move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
         seconds += max(block.period, camera.min_period, tail + ready) if i else ready
         at = angle
     return seconds + tail
@@ -279,7 +285,8 @@ def describe(
     views = timeline.views
     rows, cols = camera.shape
     stored = f" ({len(views.stored)} of them stored)" if views.stored else ""
-    facts = [("views", f"{views.n}{stored}, {plan.scheme} angles, {plan.mode} scan")]
+    several = f" of {plan.frames_per_view} frames each" if plan.frames_per_view > 1 else ""
+    facts = [("views", f"{plan.n_views}{several}{stored}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
         passes = f" in each of {len(views.trains)} passes" if len(views.trains) > 1 else ""
         count = 2 * math.pi / stage.counts_per_turn

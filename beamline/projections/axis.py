@@ -16,16 +16,18 @@ from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
 from beamline.projections.usable_views import UsableViews
 from beamline.storage.readers.base import ScanSource
-from recon.axis_by_views import COLS, VIEWS, axis_by_views
+from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.base.views import spread, spread_views
-from recon.prep.align import AxisError, AxisEstimate, find_axis
+from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, closest_pair, find_axis
 from recon.prep.correct import Projections
 from recon.prep.jump_parts import longest_part
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
+_PAIR_AGREES = 0.75  # columns from one pair of opposite views to an axis that is given
+_PAIR_MISSES = 2.0  # columns by which such a pair may miss half a turn, at the edge of the field
 _CANDIDATES = 14  # of the axis of a cone, usually
 
 
@@ -44,6 +46,8 @@ def rotation_axis(
         ConfigError: it lies outside the detector.
     """
     axis_col, axis = selection.axis_col, None
+    if (stated := poses_of(source, selection, usable.frames)) is not None and stated.vectors is not None:
+        return stated.axis_col, None
     posed = stated_poses(source, selection) is not None  # opposite views are then no mirror images
     if axis_col is None and (posed or cone_of(source, selection) is not None):
         axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
@@ -52,7 +56,36 @@ def rotation_axis(
         by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
+    if selection.axis_col is not None and not posed and cone_of(source, selection) is None:
+        _compare_with_pair(source, axis_col, correction.quiet(), usable.frames, warn)
     return axis_col, axis
+
+
+def _compare_with_pair(
+    source: ScanSource, given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
+) -> None:
+    """Warn where two views half a turn apart are mirror images about another column than the one that was given."""
+    cols = source.shape[1]
+    pair = closest_pair(source.angles[frames], tolerance=2 * _PAIR_MISSES / cols)
+    if pair is None or not cols / 8 < given < 7 * cols / 8:  # nearer to the edge too little is seen twice
+        return
+    height = (correction.rows.stop - correction.rows.start) // correction.binning
+    start = max(0, (height - _AXIS_ROWS) // 2)
+    with suppress(DataError, ValueError):  # these two do not show the axis
+        views = correction.at_once(np.sort(frames[list(pair)]), slice(start, min(height, start + _AXIS_ROWS)))
+        if views.view_ids.size < 2:
+            return
+        estimate = axis_from_pair(*views.data)
+        seen = unbinned(estimate.value, correction.binning)
+        turned = np.ptp(source.angles[views.view_ids]) % (2 * np.pi)
+        uncertain = abs(turned - np.pi) * cols / 4  # columns, of matter half-way to the edge
+        if estimate.confident and abs(seen - given) > _PAIR_AGREES * correction.binning + uncertain:
+            warn(
+                f"Frames {views.view_ids[0]} and {views.view_ids[1]}, about half a turn apart, are mirror images about "
+                f"column {seen:.2f}; the rotation axis given is column {given:g}. Columns are counted from 0 at the "
+                "centre of the first. Unless the sample moved, leave --axis out, or compare axes by "
+                "`beamline sweep FILE axis=A:B:STEP`."
+            )
 
 
 def _axis_by_views(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -22,8 +23,8 @@ from beamline.projections.read import read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.rules.unlit import ViewLight
-from beamline.storage.rules.validate import altered_sentence
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons
@@ -200,6 +201,12 @@ class ScanCorrection:
         self._look_for_shadow(views)
         return unknown and self._shadow is not None and bool(self._shadow.any())
 
+    def quiet(self) -> ScanCorrection:
+        """The same references, for a few views; it warns of nothing."""
+        other = copy(self)
+        other._warn, other._shadow = lambda sentence: None, None
+        return other
+
     def renewed(self) -> ScanCorrection:
         """A correction of the same views by all references that are there now."""
         return ScanCorrection(self._source, self._selection, self._warn)
@@ -229,7 +236,21 @@ class ScanCorrection:
             lit[at] = not self._light.unlit(int(frames[at]))
         if not lit.all():
             data, frames = data[lit], frames[lit]
+        if rows is None and self._beam is not None:
+            self._warn_of_copies(data, frames)
         return data, frames
+
+    def _warn_of_copies(self, data: NDArray[Any], frames: NDArray[np.int64]) -> None:
+        """Warn of views that equal the one before pixel by pixel: no camera takes the same counts twice."""
+        middle = data.shape[1] // 2
+        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))  # soon tells most of them apart
+        copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
+        if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
+            self._warn(
+                f"{count(len(copies), 'view')} of {len(frames)} (frames {spans(copies)}) hold the pixels of the view "
+                "before: the camera or its driver gave an image twice. Their angles are then wrong for what they show: "
+                "leave them out with --views or --flags judge, or repeat them."
+            )
 
     def _no_view(self) -> NoViewError:
         return NoViewError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,24 +14,25 @@ from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
+from beamline.projections.consistency import warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
-from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
-from beamline.projections.emission import prepare_emission
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanStep
 from beamline.projections.refusals import checked_views
-from beamline.projections.registry import in_order
+from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.truncation import cut_sentence, cut_sides
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import ViewGeometry
+from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
+from recon.base.registry import in_folders
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
@@ -39,6 +41,7 @@ from recon.voxels.projector import seen_rays
 
 _SAME_AXIS = 0.05  # columns
 _HELD_OUT_VIEWS = 16
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,17 @@ class DiskBuffer:
     views: NDArray[np.float32]
     batch: int
     progress: Callable[[int, int], None]
+
+
+def _warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
+    degrees = float(source.attributes.get(JOINED_DEG, 0.0))
+    blur = np.radians(degrees) * source.shape[1] / 2
+    if blur > _JOINED_BLUR:
+        warn(
+            f"--frames-per-view {source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
+            f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
+            "as the scan took at each angle, or leave it out."
+        )
 
 
 def prepare_projections(
@@ -82,10 +96,11 @@ def prepare_projections(
     """
     if (emission := source.emission) is not None:
         if buffer is not None:
-            raise DataError(
-                f"{source.path}: counts of an emission have to be in memory. Give more --memory, or --rows."
-            )
-        return prepare_emission(source, emission, selection, warn)
+            raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
+        views = import_module(in_folders("beamline.features", "VIEWS")["emission"])
+        emitted: PreparedProjections = views.prepare_emission(source, emission, selection, warn)
+        return emitted
+    _warn_of_joined_views(source, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
     usable, poses = _usable(source, selection, warn)
@@ -107,25 +122,37 @@ def prepare_projections(
     phases.enter("correction")
     projections = _corrected(source, correction, used, buffer, phases)
     phases.enter("background, rings, views held out, hardening", "corrections")
-    held_out = None
-    with suppress(NoViewError):  # those held out may all be without light
-        held_out = correction.at_once(others) if others.size else None
-    geometry, on_disk = view_geometry.of(projections.view_ids), buffer is not None
-    at = view_geometry.axis_col, axis
-    prepared = assemble(source, selection, projections, geometry, at, usable, warn, on_disk)
-    if held_out is not None:
+    geometry, place = view_geometry.of(projections.view_ids), (view_geometry.axis_col, axis)
+    prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
+    prepared = _with_held_out(prepared, correction, view_geometry, others)
+    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
+    prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
+    prepared = _after_scan_steps(source, selection, prepared, phases)
+    warn_of_inconsistency(prepared, selection, warn)
+    return prepared if buffer is None else _with_unknown_filled(prepared)
+
+
+def _with_held_out(
+    prepared: PreparedProjections, correction: ScanCorrection, view_geometry: ViewGeometry, others: NDArray[np.int64]
+) -> PreparedProjections:
+    """Add the line integrals of the views held out; without any, or if none has light, nothing is added."""
+    if not others.size:
+        return prepared
+    with suppress(NoViewError):
+        held_out = correction.at_once(others)
         prepared = replace(
             prepared,
             held_out=(held_out.data, view_geometry.of(held_out.view_ids)),
             held_out_ids=held_out.view_ids,
             held_out_weights=held_out.weights,
         )
-    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
-    done = {**correction.done, **tilt, **view_geometry.done}
-    prepared = _after_scan_steps(source, selection, replace(prepared, done=done), phases)
-    if on_disk:
-        _fill_unknown(prepared)
     return prepared
+
+
+def require_usable(source: ScanSource, selection: Selection) -> None:
+    """Raise what `prepare_projections` refuses before it reads a frame."""
+    if source.emission is None:
+        _usable(source, selection, lambda sentence: None)
 
 
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
@@ -133,7 +160,8 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     usable = checked_views(source, selection, warn)
     pixel_size(source, selection)
     first = choose_views(source, usable.frames, selection)
-    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
+    for step in geometry_steps(selection):
+        step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
@@ -198,8 +226,8 @@ def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: floa
     )
 
 
-def _fill_unknown(prepared: PreparedProjections) -> None:
-    """Fill, view by view, what `ray_weights` says weighs nothing, as `masked` does for all views."""
+def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
+    """Fill, view by view and in place, what `ray_weights` says weighs nothing, as `masked` does for all views."""
     data, geometry = prepared.projections.data, prepared.geometry
     seen = seen_rays(geometry, Grid.matching(geometry)) if prepared.leaves_slices else None
     for view in range(len(data)):
@@ -213,6 +241,7 @@ def _fill_unknown(prepared: PreparedProjections) -> None:
             weights *= seen[view]
         if not weights.all():
             data[view] = masked(data[view : view + 1], weights[None])[0][0]
+    return prepared
 
 
 def assemble(

@@ -19,7 +19,7 @@ from recon.base.method import Energies
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.voxels.emission import Emission
+from recon.prep.emission import Emission
 from recon.voxels.projector import seen_rays
 
 

@@ -150,6 +150,60 @@ class RayStep(PrepStep, Protocol):
         """
 
 
+class GeometryLearnt(Protocol):
+    """What was learnt of the geometry of some views.
+
+    Attributes:
+        axis: displacement of the rotation axis in the detector's middle row, in columns.
+        done: what the step did.
+    """
+
+    @property
+    def axis(self) -> float: ...
+
+    @property
+    def done(self) -> StepDone: ...
+
+    def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of these rows of the file, which may be binned, as it was learnt."""
+
+
+@runtime_checkable
+class GeometryStep(PrepStep, Protocol):
+    """A step that learns the geometry from the views of a finished scan.
+
+    Attributes:
+        asked_by: the option that asks for it.
+        geometry: names of the terms that are to be learnt; "roll", "tilt" and "shifts" let rows show other slices.
+        may_lean: views may come out rolled or tilted.
+    """
+
+    asked_by: ClassVar[str]
+
+    @property
+    def geometry(self) -> frozenset[str]: ...
+
+    @property
+    def may_lean(self) -> bool: ...
+
+    def refuse_few(self, used: int, usable: int, cols: int) -> None:
+        """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+
+    def learn(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        frames: NDArray[np.int64],
+        geometry_before: Callable[[Selection, NDArray[np.int64]], Geometry],
+        progress: Callable[[int, int], None],
+    ) -> GeometryLearnt:
+        """The geometry of these frames, from views whose geometry is otherwise known.
+
+        Raises:
+            DataError: too few views, or nothing in the beam.
+        """
+
+
 @runtime_checkable
 class ScanStep(PrepStep, Protocol):
     """A step on all views of a scan."""

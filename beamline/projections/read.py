@@ -14,7 +14,7 @@ from beamline.projections.corrections.flags import Flags
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource, read_known
 
-_BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
+BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 
 
 def read_binned(
@@ -33,7 +33,7 @@ def read_binned(
     whole = binning == 1 and source.dtype.kind in "ui"
     out = np.empty((len(frames), height, width), source.dtype.newbyteorder("=") if whole else np.float32)
     frame_bytes = (rows.stop - rows.start) * source.shape[1] * source.dtype.itemsize
-    batch = max(1, _BATCH_BYTES // max(1, frame_bytes))
+    batch = max(1, BATCH_BYTES // max(1, frame_bytes))
     for start in range(0, len(frames), batch):
         raw = read_known(source, frames[start : start + batch], rows)
         if binning > 1:
@@ -46,7 +46,7 @@ def read_binned(
 def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
     """Bytes that `read_binned` takes, with what it returns."""
     pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
-    at_once = min(frames, max(1, _BATCH_BYTES // max(1, pixels * itemsize))) * pixels
+    at_once = min(frames, max(1, BATCH_BYTES // max(1, pixels * itemsize))) * pixels
     if binning == 1:
         return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize
     return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2)  # as float32, with a mask

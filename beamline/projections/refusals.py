@@ -7,15 +7,19 @@ from collections.abc import Iterable
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.corrections.flags import Flags, usable_views
+from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules import angle_order
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
-from beamline.storage.rules.validate import quantity_stated, references_present, scan_ended, scan_findings
+
+_OF_A_CIRCLE = angle_order.RULE, "axis"  # rules on what vectors of each view take the place of
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -32,6 +36,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, accepted)]
     if flags.used:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
+    if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:
+        findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(source, findings)
     usable = usable_views(source, flags.used, judged)
     if usable.sentence:

@@ -8,9 +8,9 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.protocols import PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
+from beamline.projections.protocols import GeometryStep, PlaceStep, PrepStep, RayStep, ScanStep, ViewStep
 from beamline.projections.step import StepDone, key_of, options_of
-from recon.base.registry import Registry
+from recon.base.registry import Registry, in_folders
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -24,15 +24,11 @@ REGISTRY: dict[str, str] = {
     "CountModel": "counts",
     "Defects": "counts",
     "Flats": "references",
-    "Phase": "phase",
-    "Jumps": "jumps",
     "PosesOfFile": "poses",
     "Width": "width",
-    "Calibrate": "calibrate",
-    "Rings": "rings",
-    "Hardening": "hardening",
+    **in_folders("beamline.projections.corrections", "STEPS"),
 }
-"""Class, and its module in `corrections`; options stand in this order."""
+"""Class, and its module in `corrections`; options stand in this order. STEPS of a folder there says its steps."""
 
 
 @cache
@@ -65,12 +61,17 @@ def all_steps() -> tuple[type[PrepStep], ...]:
     """Every step, each after those that it follows."""
     by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
     order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
-    return tuple(by_name[name] for name in order)
+    return tuple(by_name[name] for name in order if name in by_name)  # a step may follow one of a feature
 
 
 def in_order(selection: Selection) -> list[PrepStep]:
     """Every step that there is as the selection has it, each after those that it follows."""
     return [selection.step(kind) for kind in all_steps()]
+
+
+def geometry_steps(selection: Selection) -> list[GeometryStep]:
+    """The steps that can learn the geometry from the views, as the selection has them."""
+    return [step for step in in_order(selection) if isinstance(step, GeometryStep)]
 
 
 def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:

@@ -20,10 +20,11 @@ from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.interrupted import next_step
+from beamline.storage.readers.averaged import stated_frames_per_view
 from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.rules.references import reference_groups
-from beamline.storage.rules.validate import altered_sentence
+from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
@@ -223,8 +224,9 @@ def context_of(source: ScanSource) -> ScanContext:
     fly = source.plan.get("mode") == "fly"
     period = (float(source.attributes.get("period_s", 0)) or None) if fly else None
     context = ScanContext(
-        _saturation(source), rows * cols, period, _step(source), cone=source.cone is not None, axis_col=source.axis_col
-    )
+        _saturation(source), rows * cols, period, _step(source), stated_frames_per_view(source),
+        cone=source.cone is not None, axis_col=source.axis_col,
+    )  # fmt: skip
     if source.quantity != "line_integrals":
         return context
     preview = digest(np.zeros(source.shape, np.uint16), preview_bin=check_block(source.shape)).preview
@@ -235,7 +237,7 @@ def _step(source: ScanSource) -> float:
     """Radians from a view to the next, as the plan of our own scans has them, or as the file has its views."""
     planned = source.plan.get("angles_deg")
     if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
-        return usual_step(np.radians(planned))
+        return usual_step(np.radians(planned[:: stated_frames_per_view(source)]))
     return usual_step(source.angles[source.image_key == FrameKind.PROJECTION])
 
 

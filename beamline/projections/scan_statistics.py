@@ -200,6 +200,7 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
     known = [each[np.isfinite(each)] for each in seconds]
     if all(each.size for each in known):  # else of one exposure time
         photons *= float(known[0].mean() / known[1].mean())
+    photons *= source.frames_per_view
     views = int(np.count_nonzero(source.image_key == FrameKind.PROJECTION))
     if asked.material is None:
         return Light(views, photons)

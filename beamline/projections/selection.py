@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.projections.step import NamedStep
 from recon.base.geometry import Geometry
+from recon.base.settings_check import check_settings
 from recon.base.views import parse_views
 
 if TYPE_CHECKING:
@@ -47,6 +48,12 @@ class Selection:
     seed: int = 0
     axis_rows: tuple[int, int] | None = None
     steps: tuple[NamedStep, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        for name in ("rows", "cone", "axis_rows"):  # a pair from a list or an array is the same pair
+            if (pair := getattr(self, name)) is not None:
+                object.__setattr__(self, name, tuple(getattr(pair, "tolist", lambda pair=pair: pair)()))
 
     def step(self, kind: type[S]) -> S:
         """The step of a kind: the one given, else one that does what its defaults say."""

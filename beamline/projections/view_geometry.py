@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
-from beamline.projections.corrections.calibrate import Calibrate, Calibrated
 from beamline.projections.corrections.poses import poses_of
-from beamline.projections.protocols import PlaceStep, RayStep, ViewMotion
-from beamline.projections.registry import in_order
+from beamline.projections.protocols import GeometryLearnt, PlaceStep, RayStep, ViewMotion
+from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
@@ -64,7 +63,7 @@ class ViewGeometry:
         stated_axis: the column of the rotation axis before calibration.
         moved: where the sample was in the views, by the name of the step that found it.
         rays: what the steps on rays did, by name.
-        learnt: by calibration; None: nothing.
+        learnt: what was learnt of the geometry, by the name of the step.
     """
 
     source: ScanSource
@@ -72,17 +71,17 @@ class ViewGeometry:
     stated_axis: float
     moved: dict[str, ViewMotion] = field(default_factory=dict)
     rays: dict[str, StepDone] = field(default_factory=dict)
-    learnt: Calibrated | None = None
+    learnt: dict[str, GeometryLearnt] = field(default_factory=dict)
 
     @property
     def axis_col(self) -> float:
         """The column of the rotation axis."""
-        return self.stated_axis if self.learnt is None else self.stated_axis + self.learnt.axis
+        return self.stated_axis + sum(learnt.axis for learnt in self.learnt.values())
 
     @property
     def done(self) -> dict[str, StepDone]:
         """What the steps did, by their names."""
-        calibrated = {} if self.learnt is None else {self.selection.step(Calibrate).name: self.learnt.done}
+        calibrated = {name: learnt.done for name, learnt in self.learnt.items()}
         return {**{name: motion.done for name, motion in self.moved.items()}, **self.rays, **calibrated}
 
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
@@ -97,10 +96,11 @@ class ViewGeometry:
 
     def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
         """Learn the geometry from these views, where that is asked for."""
-        step = self.selection.step(Calibrate)
-        if step.geometry:
-            phases.enter("calibration", "steps")
-            self.learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+        for step in geometry_steps(self.selection):
+            if step.geometry:
+                phases.enter("calibration", "steps")
+                learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+                self.learnt[step.name] = learnt
 
     def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views, before calibration."""
@@ -113,4 +113,6 @@ class ViewGeometry:
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views."""
         geometry = self.uncalibrated(self.selection, view_ids)
-        return geometry if self.learnt is None else self.learnt.corrected(geometry, view_ids)
+        for learnt in self.learnt.values():
+            geometry = learnt.corrected(geometry, view_ids)
+        return geometry

@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -34,50 +33,6 @@ _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
 _OF_TRIALS = 0.4  # of the time of a method on voxels, that trials of its weight may take
 _LEVEL = 0.3  # dB: by the curves of four scans such methods are level
-
-
-@dataclass(frozen=True, eq=False)
-class Budgeted:
-    """A reconstruction within a time limit.
-
-    Attributes:
-        prepared: the reconstructed views, with binned pixels if the choice bins them.
-        choice, speeds: what was chosen, and what its parts were expected to take.
-        because: why this method, in words; empty if there was no other.
-        seconds: of everything but what is measured once on a machine.
-    """
-
-    result: Reconstruction
-    prepared: PreparedProjections
-    choice: Choice
-    speeds: Speeds
-    because: str
-    seconds: float
-
-    def settings(self, budget: float) -> dict[str, Any]:
-        """For the record."""
-        c, s = self.choice, self.speeds
-        return {
-            "budget": budget,
-            "budget_used": self.seconds,
-            "chosen_method": self.result.method,
-            "chosen_because": self.because,
-            "chosen_binning": c.binning,
-            "chosen_share": c.share,
-            "expected_steps": c.steps,
-            "expected_gain_db": c.gain,
-            "expected_s": c.seconds,
-            "measured_fbp_s": s.fbp,
-            "measured_start_s": s.start,
-            "measured_step_s": s.step,
-            "measured_fill_s": s.fill,
-            "measured_sweep_s": s.sweep,
-        }
-
-    def summary(self, budget: float) -> str:
-        """The choice and why, in a line."""
-        why = f"; {self.because}" if self.because else ""
-        return f"{_named(self.choice, self.result)}: {duration_text(self.seconds)} of {duration_text(budget)}{why}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +77,7 @@ def within(
     warn: Warn,
     largest: int | None = None,
     rates: Rates | None = None,
-) -> Budgeted:
+) -> tuple[Reconstruction, PreparedProjections]:
     """Reconstruct within `budget` seconds by the clock of `control`.
 
     For each method the settings that the time suffices for follow from its measured curves. Several methods are tried
@@ -136,6 +91,10 @@ def within(
             Iterations on voxels are none where the sample is wider than the field.
         largest: binning; None: any.
         rates: of this machine; None: measured, or those kept.
+
+    Returns:
+        The volume, whose settings say what was chosen and how long it should have taken; its seconds are of everything
+        but what is measured once on a machine. Then the views that it used, with binned pixels if the choice bins them.
 
     Raises:
         ValueError: the views cannot be reconstructed.
@@ -164,7 +123,32 @@ def within(
     method = plan.method(choice, unbinned)
     end = begin + budget * (1 - _RESERVE)
     result = _run(method, prepared, seed, end, control)
-    return Budgeted(result, prepared, choice, speeds, because, now() - begin)
+    return _marked(result, choice, speeds, because, budget, now() - begin), prepared
+
+
+def _marked(
+    result: Reconstruction, choice: Choice, speeds: Speeds, because: str, budget: float, seconds: float
+) -> Reconstruction:
+    """The result with what was chosen and why, what its parts were expected to take, and what all of it took."""
+    settings = {
+        "budget": budget,
+        "budget_used": seconds,
+        "chosen_method": result.method,
+        "chosen_because": because,
+        "chosen_binning": choice.binning,
+        "chosen_share": choice.share,
+        "expected_steps": choice.steps,
+        "expected_gain_db": choice.gain,
+        "expected_s": choice.seconds,
+        "measured_fbp_s": speeds.fbp,
+        "measured_start_s": speeds.start,
+        "measured_step_s": speeds.step,
+        "measured_fill_s": speeds.fill,
+        "measured_sweep_s": speeds.sweep,
+    }
+    why = f"; {because}" if because else ""
+    chosen = f"{_named(choice, result)}: {duration_text(seconds)} of {duration_text(budget)}{why}"
+    return replace(result, seconds=seconds, chosen=chosen, settings={**result.settings, **settings})
 
 
 def _is_wider(prepared: PreparedProjections) -> bool:

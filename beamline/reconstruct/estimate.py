@@ -3,38 +3,54 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from beamline.core.errors import DataError
+from beamline.core.need import Need
 from beamline.core.text import count, size
+from beamline.projections.prepare import require_usable
+from beamline.projections.selection import check_axis, cone_of
 from beamline.projections.view_geometry import stated_geometry
-from beamline.reconstruct.energy_views import repeated, views_of_others
-from beamline.reconstruct.error_bars import refuse_impossible
-from beamline.reconstruct.needs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
+from beamline.reconstruct.error_bars import refuse_views
+from beamline.reconstruct.measure import fit_truth
+from beamline.reconstruct.memory import (
+    memory_of,
+    recon_memory_of,
+    refuse_few_views,
+    refuse_slabs,
+    refuse_smallest,
+    refuse_whole,
+    surely_weighted,
+)
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.refusals import refuse_before_reading
+from beamline.reconstruct.region import Region, locate
+from beamline.reconstruct.several_scans import SeveralScans, views_of_others, with_as_many_views
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from recon.assess.time_model import duration_text
-from recon.base.method import volumes_of
-from recon.base.slabs import slabs_of
+from recon.base.geometry import Geometry
+from recon.base.method import Method, volumes_of
+from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """The resources of a reconstruction.
+@dataclass(frozen=True, kw_only=True)
+class Estimate(Need):
+    """What a reconstruction will take. Its seconds are without reading and correction; without scratch it is at once.
 
     Attributes:
         shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
-        memory: bytes that will be used.
         slabs: that are still to be made.
         done: slices that a partial volume has.
-        scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
-        output, free: bytes of the result, and bytes on its disk.
-        seconds: at most, without reading and correction; None: the method does not say what it computes.
-        least_seconds: where the data choose what takes least; otherwise `seconds`.
+        free: bytes on the disk of the output.
     """
 
     method: str
@@ -42,14 +58,9 @@ class Estimate:
     shape: tuple[int, ...]
     at_once: int
     allowed: int
-    memory: int
     slabs: int
     done: int
-    scratch: int
-    output: int
     free: int
-    seconds: float | None
-    least_seconds: float | None
 
     def lines(self) -> list[str]:
         in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
@@ -60,7 +71,7 @@ class Estimate:
         what = f"{'volumes':<10}{several[0]} of " if several else f"{'volume':<10}"
         return [
             f"{what}{z} x {y} x {x} voxels by {self.method}, from {self.views} views",
-            f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
+            f"{'memory':<10}{size(self.memory or 0)} of {size(self.allowed)}, {how}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
             f"{'time':<10}{self._time()}",
         ]
@@ -74,7 +85,8 @@ class Estimate:
 
 
 def estimate(options: ReconOptions, rates: Rates) -> Estimate:
-    """Estimate for a finished scan; for a partial volume, of the missing slabs. No frame is read, and nothing is run.
+    """Estimate for a finished scan; for a partial volume, of the missing slabs. Nothing is run. Frames
+    are read only to find a region around the sample.
 
     Args:
         rates: of this machine.
@@ -82,16 +94,14 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
             partial volume with another number of slices.
-        ConfigError: the selection does not fit the scan, or an option needs more memory than there is. Also
-            for a method without error bars, where they are wanted.
+        ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
+        All else that the reconstruction refuses before it reads a frame.
     """
-    if options.uncertainty:
-        refuse_impossible(options)
+    truth = refuse_before_reading(options)
     with options.source.open() as source:
         options = options.around_region(source)
-        geometry = stated_geometry(source, options.selection)
-        geometry = repeated(geometry, geometry.n_views + views_of_others(options.source, options.selection))
-        allowed, needs = memory_of(options), needs_of(source, options)
+        geometry = _checked_geometry(source, options, truth)
+        allowed, needs = memory_of(options), recon_memory_of(source, options)
         shape = Grid.matching(geometry).shape
         slabs = missing = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
@@ -101,6 +111,8 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
                 "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
             )
         if not fits:
+            if options.partial is None:
+                options.target.refuse_partial()
             refuse_whole(source, options, needs, allowed)
             needs = replace(needs, weighted=surely_weighted(source, options))
             refuse_smallest(source, needs, allowed, options.selection.binning)
@@ -113,23 +125,63 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     output, meanwhile = (needs.volume, 0) if fits else options.disk_needs(needs.volume)
     scratch = 0 if fits else needs.line_integrals + meanwhile
     free = _room(options, scratch + output)
-    heights = [slab.slices.stop - slab.slices.start for slab in missing]
-    try:
-        costs = costs_of(needs.method, parts_of(geometry, heights), decided=options.partial is not None)
-    except ValueError as error:  # as the method itself refuses the views
-        raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
-    span = None if costs is None else seconds_of(costs, rates)
-    if not missing:
-        span = Span(0.0, 0.0)
-    times = 1 + options.uncertainty  # error bars take at most as long
+    span = _span(options, needs.method, geometry, missing, rates)
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
     height = slabs[0].own.stop
     of_all = shape if (several := volumes_of(needs.method)) == 1 else (several, *shape)
     return Estimate(
-        options.method.name, geometry.n_views, of_all, needs.at_once, allowed,
-        needs.at_once if fits else max(needs.slab(height), needs.least), len(missing), done, scratch, output, free,
-        None if span is None else times * span.most, None if span is None else times * span.least,
-    )  # fmt: skip
+        method=options.method.name,
+        views=geometry.n_views,
+        shape=of_all,
+        at_once=needs.at_once,
+        allowed=allowed,
+        memory=needs.at_once if fits else max(needs.slab(height), needs.least),
+        slabs=len(missing),
+        done=done,
+        scratch=scratch,
+        output=output,
+        free=free,
+        seconds=None if span is None else span.most,
+        least_seconds=None if span is None else span.least,
+    )
+
+
+def _span(
+    options: ReconOptions, method: Method, geometry: Geometry, missing: Sequence[Slab], rates: Rates
+) -> Span | None:
+    """The seconds of these slabs; None where the method does not say what it computes."""
+    if not missing:
+        return Span(0.0, 0.0)
+    heights = [slab.slices.stop - slab.slices.start for slab in missing]
+    try:
+        costs = costs_of(method, parts_of(geometry, heights), decided=options.partial is not None)
+    except ValueError as error:  # as the method itself refuses the views
+        raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}.") from error
+    if costs is None:
+        return None
+    span, times = seconds_of(costs, rates), 1 + options.uncertainty  # error bars take at most as long
+    return Span(times * span.least, times * span.most)
+
+
+def _checked_geometry(source: ScanSource, options: ReconOptions, truth: NDArray[np.float32] | None) -> Geometry:
+    """The stated geometry of all views. ConfigError and DataError as the reconstruction, before it reads a frame."""
+    scans, selection = options.source, options.selection
+    require_usable(source, selection)
+    geometry = stated_geometry(source, selection)
+    for axis in (selection.axis_col, source.axis_col if cone_of(source, selection) is None else None):
+        if axis is not None:
+            check_axis(source, axis)
+    if isinstance(scans, SeveralScans):
+        scans.require_alike(selection)
+    geometry = with_as_many_views(geometry, geometry.n_views + views_of_others(scans, selection))
+    refuse_few_views(source, options, geometry)
+    if isinstance(options.region, Region):
+        locate(options.region, selection, geometry)
+    if options.uncertainty:
+        refuse_views(options.method_for(geometry), geometry)
+    if truth is not None:
+        fit_truth(truth, Grid.matching(geometry), selection.binning)
+    return geometry
 
 
 def _room(options: ReconOptions, needed: int) -> int:

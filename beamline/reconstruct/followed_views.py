@@ -1,22 +1,42 @@
-"""Followed views: which frames of a growing file are views, how far the fit has taken them, and their geometry."""
+"""Followed views: which frames of a growing file are views, their geometry, and how far the fit has come with them."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import DataError
+from beamline.core.events import EnoughReached, Sink, StateEntered
+from beamline.core.sinks import Warnings
+from beamline.projections.axis import locate_axis, stated_axis
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.flags import Flags, usable_views
-from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import with_rays
 from beamline.storage.readers.base import ScanSource
+from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
+from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
+
+
+class FollowState(Enum):
+    """What the fit of a growing scan waits for, or does."""
+
+    WAITS_FOR_REFERENCES = auto()
+    WAITS_FOR_AXIS = auto()
+    FEEDS = auto()
+    ENDED = auto()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +80,11 @@ class FollowedViews:
     source: ScanSource
     selection: Selection
 
+    @property
+    def n(self) -> int:
+        """Views in the file, those with a flag among them."""
+        return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
+
     def usable(self) -> UsableViews:
         """Those that are in the file and may be used."""
         return usable_views(self.source, self.selection.step(Flags).used)
@@ -83,3 +108,154 @@ class FollowedViews:
         """[view] radians for the fit: in the middle of the exposure, of the middle row. The fit knows no motion."""
         geometry, _ = self.geometry(axis_col, view_ids)
         return np.asarray(geometry.angles + geometry.skew * (geometry.detector_shape[0] - 1) / 2)
+
+
+_FIRST_VIEWS = 12  # fewer views do not determine an axis
+
+
+class AxisSearch:
+    """Looks for the axis each time the views have grown by half, and once more when all are there.
+
+    Attributes:
+        col: the axis in pixels of the file; None while it is unknown.
+        estimate: how it was found; None if it was given or stated.
+        settled: the search is over.
+    """
+
+    def __init__(self, source: ScanSource, selection: Selection, warn: Warnings) -> None:
+        self._source, self._selection, self._warn = source, selection, warn
+        self.col = source.axis_col if selection.axis_col is None else selection.axis_col
+        self.estimate: AxisEstimate | None = None
+        self.settled = self.col is not None
+        self._next = _FIRST_VIEWS
+
+    def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
+        """Look for the axis in these views (frames of the file), if it is time. While views come, only a clear optimum
+        counts.
+
+        Raises:
+            DataError: the scan has ended, and no axis is found.
+        """
+        if cone_of(self._source, self._selection) is not None:
+            self.col, self.settled = stated_axis(self._source), True
+            return
+        if views.size < self._next and not ended:
+            return
+        self._next, self.settled = views.size + views.size // 2, ended
+        last_chance = ended and self.col is None
+        try:
+            told = self._warn if last_chance else _quiet
+            axis_col, estimate = locate_axis(self._source, correction, views, told, all_there=last_chance)
+        except DataError:
+            if last_chance:
+                raise
+            return  # the views do not cover enough angles yet
+        if estimate.confident or last_chance:
+            self.col, self.estimate = axis_col, estimate
+
+
+def _quiet(text: str) -> None:
+    """Hides warnings on an axis that will be searched again."""
+
+
+GROWTH = 1.25  # growth of the views between predictions
+_FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
+
+
+class NotPlannedError(Exception):
+    """The further views are unknown; the message says why."""
+
+
+def planned_views(
+    source: ScanSource, selection: Selection, axis_col: float | None, taken: Sequence[NDArray[np.int64]]
+) -> Geometry:
+    """Geometry of the views so far and of the further views in the plan.
+
+    Args:
+        taken: frames of the views so far, in batches.
+
+    Raises:
+        NotPlannedError: the beam is a cone, or the file says no plan.
+    """
+    if cone_of(source, selection) is not None:
+        raise NotPlannedError("its beam is a cone")
+    if source.part_starts.size > 1:
+        raise NotPlannedError("it goes on with a run that ended early, so that views come out of their order")
+    angles = source.plan.get("angles_deg")
+    if angles is None or axis_col is None:
+        raise NotPlannedError("its file does not say which views are planned")
+    places = parse_views(selection.views, np.zeros(len(angles)))
+    last = max(int(ids[-1]) for ids in taken)
+    n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
+    to_come = np.radians(np.asarray(angles, np.float64)[places[places >= n_taken]])
+    so_far = [source.angles[ids] for ids in taken]
+    return geometry_of(source, selection, axis_col, np.concatenate([*so_far, to_come]))
+
+
+class EnoughViews:
+    """Looks at the views each time they have grown by a quarter.
+
+    A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
+    which errs on the side of more views.
+    """
+
+    def __init__(self, goal: Goal, seed: int) -> None:
+        self._goal = goal
+        self._rng = np.random.default_rng(seed)
+        self._samples: list[float] = []
+        self.next_look = _FIRST
+
+    def look(self, data: NDArray[np.float32], planned: Geometry) -> Gain | None:
+        """The gain by the further views; None if it is not (yet) known.
+
+        Args:
+            data: line integrals [view, row, col] so far.
+            planned: geometry of these views and of those to come.
+        """
+        n = len(data)
+        if not self.next_look <= n < planned.n_views or not well_spread(planned.angles[:n]):
+            return None
+        self.next_look = math.ceil(GROWTH * n)
+        before = self._samples
+        try:
+            self._samples = predicted_gains(data, planned, self._rng, _SAMPLES)
+        except ValueError:  # views without matter
+            return None
+        return Gain.of(n, planned.n_views, before + self._samples) if before else None
+
+    def met(self, gain: Gain) -> bool:
+        """Whether the views so far are enough."""
+        return self._goal.met(gain)
+
+
+def report_gain(
+    enough: EnoughViews,
+    views: FollowedViews,
+    taken: Sequence[NDArray[np.int64]],
+    data: NDArray[np.float32],
+    axis_col: float | None,
+    sink: Sink,
+    clock: Clock,
+    warn: Warnings,
+) -> bool:
+    """Report the gain by further views, and whether those so far are enough. False: there is no more to ask.
+
+    Args:
+        taken: frames of the views so far, in batches.
+        data: their line integrals [view, row, col].
+    """
+    try:
+        planned = planned_views(views.source, views.selection, axis_col, taken)
+    except NotPlannedError as error:
+        warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
+        return False
+    gain = enough.look(data, planned)
+    if gain is None:
+        return True
+    if enough.met(gain):
+        sink(EnoughReached(**vars(gain), time=clock.now()))
+        return False
+    spread = f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"
+    message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
+    sink(StateEntered("gain", message, gain, time=clock.now()))
+    return True

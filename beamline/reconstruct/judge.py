@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,7 +50,6 @@ def judge(
         in_parts: the output is made of slabs already, so that FBP cannot be kept in it.
     """
     judged = VolumeLooks(made, prepared, truth, target, context, sink, clock)
-    judged.warnings.extend(context.warnings)
     if made.series is not None:  # each view shows a volume of its own time
         judged.metrics[made.method] = {"residual": made.series.residual, "seconds": made.seconds}
         return judged
@@ -68,9 +65,8 @@ def judge(
     return judged
 
 
-@dataclass(eq=False)
 class VolumeLooks:
-    """The looks at one volume, in their order, and what they showed.
+    """The looks at one volume, in their order, and what they showed; arguments as of `judge`.
 
     Attributes:
         volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
@@ -84,25 +80,24 @@ class VolumeLooks:
         all_rays: seconds to project all views, about.
     """
 
-    made: Reconstruction
-    prepared: PreparedProjections
-    truth: Volume | None
-    target: OutputPaths
-    context: ReportContext
-    sink: Sink
-    clock: Clock
-    volumes: dict[str, Volume] = field(init=False)
-    metrics: dict[str, dict[str, float]] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)
-    unexplained: Unexplained | None = None
-    stray: StrayMass | None = None
-    hiding: str = ""
-    keeps_fbp: bool = False
-    all_rays: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.volumes = {self.made.method: self.made.volume}
+    def __init__(
+        self,
+        made: Reconstruction,
+        prepared: PreparedProjections,
+        truth: Volume | None,
+        target: OutputPaths,
+        context: ReportContext,
+        sink: Sink,
+        clock: Clock,
+    ) -> None:
+        self.made, self.prepared, self.truth, self.target, self.context = made, prepared, truth, target, context
+        self.sink, self.clock = sink, clock
+        self.volumes: dict[str, Volume] = {made.method: made.volume}
+        self.metrics: dict[str, dict[str, float]] = {}
+        self.warnings, self.left_out = list(context.warnings), list[str]()
+        self.unexplained: Unexplained | None = None
+        self.stray: StrayMass | None = None
+        self.hiding, self.keeps_fbp, self.all_rays = "", False, 0.0
 
     @property
     def waited_for(self) -> bool:

@@ -11,18 +11,16 @@ how far the fit has come in the file.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
-from enum import Enum, auto
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
+from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.jumps import Jumps
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PlaceStep, ScanStep
@@ -31,25 +29,18 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.reconstruct.axis_search import AxisSearch
-from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
-from beamline.reconstruct.followed_views import Cursor, FollowedViews
-from beamline.reconstruct.live_slices import LiveSlices
+from beamline.reconstruct.followed_views import AxisSearch, Cursor, EnoughViews, FollowedViews, FollowState, report_gain
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import corrections_done, progress_events
-from beamline.reconstruct.snapshots import Snapshots
+from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
-from drivers.base.frame import FrameKind
-from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
-from recon.base.stop import Stop
-from recon.base.volume import Grid
+from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
-from recon.splatting.finish import finish
-from recon.splatting.in_time import FINISH_SHARE, FinishPlan, finish_within
+from recon.splatting.last_round import LastRound
 from recon.splatting.stream import StreamingFit
 
-_BATCH = 32  # views corrected before the fit goes on
+BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
@@ -60,15 +51,6 @@ _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected 
 _SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
-class FollowState(Enum):
-    """What the fit of a growing scan waits for, or does."""
-
-    WAITS_FOR_REFERENCES = auto()
-    WAITS_FOR_AXIS = auto()
-    FEEDS = auto()
-    ENDED = auto()
-
-
 class ScanFollower:
     """A scan's file and the volume that grows with it. The caller decides when to look, to fit and to finish."""
 
@@ -76,7 +58,7 @@ class ScanFollower:
         self.source = source
         self.state = FollowState.WAITS_FOR_REFERENCES
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self._views, self._cursor = FollowedViews(source, options.selection), Cursor()
+        self.views, self._cursor = FollowedViews(source, options.selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
         self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None  # None: waits for references
@@ -85,17 +67,12 @@ class ScanFollower:
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
-        self._slices = LiveSlices(self._views, self.snapshots, clock)
+        self._slices = LiveSlices(self.views, self.snapshots, clock)
 
     @property
     def axis_col(self) -> float | None:
         """The rotation axis in pixels of the file; None while it is unknown."""
         return self._axis.col
-
-    @property
-    def n_views(self) -> int:
-        """Views in the file, those with a flag among them."""
-        return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
 
     @property
     def n_views_taken(self) -> int:
@@ -112,7 +89,7 @@ class ScanFollower:
         assert self.state is not FollowState.ENDED
         n = self.source.refresh()
         grown = n > self._cursor.frames
-        views = self._views.chosen(self._views.usable().frames)
+        views = self.views.chosen(self.views.usable().frames)
         self._cursor = replace(self._cursor, frames=n, taken=self._cursor.taken if views.size else n)
         if views.size:
             self._step(views, ended)
@@ -159,7 +136,7 @@ class ScanFollower:
         if abs(self.axis_col - before) > _AXIS_MOVES:
             self._fit = None
         else:
-            self._fit.move_axis(self._views.template(self.axis_col).axis_col)
+            self._fit.move_axis(self.views.template(self.axis_col).axis_col)
 
     def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
         """Feed the fit with the next views, all of one part of the file: other parts have references of their own."""
@@ -170,7 +147,7 @@ class ScanFollower:
         parts = np.searchsorted(self.source.part_starts, new, "right") - 1
         if new.size and parts[0] != self._cursor.part:
             self._begin_part(int(parts[0]))
-        batch = new[parts == parts[:1]][:_BATCH]
+        batch = new[parts == parts[:1]][:BATCH_VIEWS]
         all_taken = batch.size == new.size
         self._feed(batch, last=ended and all_taken)
         self._cursor = replace(self._cursor, taken=self._cursor.frames if all_taken else int(batch[-1]) + 1)
@@ -184,7 +161,7 @@ class ScanFollower:
         self._cursor = replace(self._cursor, part=part)
         self._settle_newest()
         if self._cursor.batches:
-            self._correct_again(self._views.usable(), _NEXT_PART)
+            self.correct_again(self.views.usable(), _NEXT_PART)
         else:
             self._correction = self._correction.renewed()
 
@@ -214,26 +191,26 @@ class ScanFollower:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
         while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
-                self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.n_views} views.")
+                self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.views.n} views.")
                 return
             self.take_new_frames(ended=True)
 
     def _angles(self, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
         assert self.axis_col is not None  # the fit has an axis
-        return self._views.angles(self.axis_col, view_ids)
+        return self.views.angles(self.axis_col, view_ids)
 
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
         options, again = self._options, bool(self._history)
         now = self._clock.now()
-        self._sink(ReconStarted(self.source.path, options.method.name, self.n_views, axis_col, again, time=now))
-        fit = options.streaming.stream(self._views.template(axis_col), options.seed, self._clock.now)
+        self._sink(ReconStarted(self.source.path, options.method.name, self.views.n, axis_col, again, time=now))
+        fit = options.streaming.stream(self.views.template(axis_col), options.seed, self._clock.now)
         for batch in self._cursor.batches:
-            fit.add_views(batch.data, self._views.angles(axis_col, batch.view_ids))
+            fit.add_views(batch.data, self.views.angles(axis_col, batch.view_ids))
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
         return fit
 
-    def _correct_again(self, usable: UsableViews, why: str) -> None:
+    def correct_again(self, usable: UsableViews, why: str) -> None:
         """Line integrals by all references and air columns, in place of those that the model has learnt from.
 
         Does nothing if the views are of one part, references and air columns are unchanged, and nothing stands in the
@@ -280,23 +257,10 @@ class ScanFollower:
         """With a goal, report the gain by further views, and once that the views so far are enough."""
         if self._enough is None or self._cursor.n_corrected < self._enough.next_look:
             return
-        try:
-            taken = [batch.view_ids for batch in self._cursor.batches]
-            planned = planned_views(self.source, self._options.selection, self.axis_col, taken)
-        except NotPlannedError as error:
-            self._warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
+        taken = [batch.view_ids for batch in self._cursor.batches]
+        data, channels = self._joined().data, (self._sink, self._clock, self._warn)
+        if not report_gain(self._enough, self.views, taken, data, self.axis_col, *channels):
             self._enough = None
-            return
-        gain = self._enough.look(self._joined().data, planned)
-        if gain is None:
-            return
-        spread = f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"
-        if self._enough.met(gain):
-            self._enough = None
-            self._sink(EnoughReached(**vars(gain), time=self._clock.now()))
-            return
-        message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
-        self._sink(StateEntered("gain", message, gain, time=self._clock.now()))
 
     def draw_slices(self, pause: float | None = None) -> None:
         """Draw slices of the views so far, if there are new ones, and `pause` s have passed (None: at once).
@@ -314,70 +278,39 @@ class ScanFollower:
         assert self._fit is not None
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
-    def finish(
-        self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
-    ) -> tuple[Reconstruction, PreparedProjections]:
-        """The last round over all views and the sweeps after it, in `seconds` or until `should_stop`, with snapshots.
-
-        Returns the volume, and the line integrals that it grew from, to judge it by.
+    def prepared(self) -> PreparedProjections:
+        """All views, corrected for good, as the fit has learnt them. No other is taken after it.
 
         Raises:
-            DataError: a scan without two views that can be used, or whose views hold no matter.
+            DataError: a scan without two views that can be used.
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
-        assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
+        assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if usable.jumps.size and self._options.selection.step(Jumps).mode == "correct":
+        if usable.jumps.size and any(
+            getattr(step, "corrects_jumps", False) for step in in_order(self._options.selection)
+        ):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
-        assert self._correction is not None
-        self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
-        prepared = self._prepared(self.axis_col, usable)
-        self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
+        self.correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
+        return self._prepared(self.axis_col, usable)
 
-        begin = last = self._clock.now()
-        stop, wanted = Stop(should_stop), self._options.streaming.finish_sweeps
-        plan = FinishPlan(0, 0.0)
-        if wanted:
-            grid = Grid.matching(prepared.geometry)
-            plan = finish_within(FINISH_SHARE * seconds, 0.0, prepared.geometry, grid, self._clock.now)
+    def last_round(self, seconds: float, snapshot_every: float) -> LastRound:
+        """The end of the fit, to be run on the prepared views: a round over all of them and sweeps, with snapshots."""
+        assert self._fit is not None
+        last = self._clock.now()
 
-        def on_progress(progress: Progress) -> bool:
+        def look(progress: Progress) -> None:
             nonlocal last
-            self._say(progress)
             if self._clock.now() - last >= snapshot_every:
                 self.write_snapshot()
                 last = self._clock.now()
-            return stop()
 
-        try:
-            self._say(self._fit.finish(max(begin + seconds - plan.seconds - self._clock.now(), 0.0), on_progress))
-        except ValueError as error:
-            raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
-        volume, gaussians = self._fit.snapshot(), self._fit.gaussians
-        sweeps = wanted if plan.sweeps is None else min(wanted, plan.sweeps)
-        if sweeps and gaussians is not None and not stop():
-            data, geometry = prepared.projections.data, prepared.geometry
-            use = DataUse(prepared.ray_weights())
-            problem = ReconProblem(data, geometry, volume.grid, use, self._options.seed, "cpu")
-            say = progress_events(self._sink, self._clock)
-            late = stop.by(begin + seconds, self._clock.now)
-            trials = None if plan.trials else lambda: True
-            control = RunControl(late, say, now=self._clock.now, stop_trials=trials)
-            volume, sweeps = finish(volume, gaussians, problem, sweeps, self._fit.settings, control)
-        settings: dict[str, object] = {
-            **asdict(self._fit.settings),
-            "finish": sweeps,
-            "seconds_after_scan": seconds,
-            "gaussians": self._history[-1].n_gaussians,
-            **({"ended_early": True} if stop.stopped else {}),
-        }
-        method, elapsed = self._options.method.name, self._clock.now() - self._begin
-        history = tuple(self._history)
-        return Reconstruction(volume, settings, history, gaussians, method=method, seconds=elapsed), prepared
+        self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=last))
+        return LastRound(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
@@ -391,7 +324,7 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        geometry, seen = self._views.geometry(axis_col, projections.view_ids)
+        geometry, seen = self.views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}

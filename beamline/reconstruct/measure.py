@@ -23,7 +23,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.projector import residual_norms
 
 _RESIDUAL_VIEWS = 16
-_RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
+RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
 _VOLUME_PATHS = ("entry/data/data", "volume", "data")
 
 
@@ -103,7 +103,7 @@ def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.fl
     views = min(geometry.n_views, _RESIDUAL_VIEWS) + (0 if held_out is None else held_out[1].n_views)
     rows, cols = geometry.detector_shape
     in_bands = geometry.rows_show_slices and grid == Grid.matching(geometry)
-    return views / geometry.n_views * (min(1.0, _RESIDUAL_RAYS / (rows * cols)) if in_bands else 1.0)
+    return views / geometry.n_views * (min(1.0, RESIDUAL_RAYS / (rows * cols)) if in_bands else 1.0)
 
 
 def measure(
@@ -233,7 +233,7 @@ def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) 
         matter: that the rows show [row]; bands lie at equal shares of it.
     """
     rows, cols = geometry.detector_shape
-    bands = max(1, _RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
+    bands = max(1, RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
     if not geometry.rows_show_slices or grid != Grid.matching(geometry):
         return [slice(0, rows)]
     if rows <= bands * _RESIDUAL_ROWS:

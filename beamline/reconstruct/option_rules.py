@@ -39,13 +39,13 @@ class OptionRule:
         return bool(self.setting or self.trait)
 
 
-AXIS_TRIALS, SLABS_RESUMED = "axis try", "resume of slabs"
-"""Stand for `--axis try`, and for `--resume` of a partial volume, which have rules of their own."""
+SLABS_RESUMED = "resume of slabs"
+"""Stands for `--resume` of a partial volume, which has rules of its own."""
 OF_ONE_VOLUME = {
     "roi": "a box is of one volume",
     "truth": "a truth is compared with one volume",
     "uncertainty": "error bars are of one volume",
-    "cluster": "several volumes are not made in slabs",
+    **dict.fromkeys(("cluster", SLABS_RESUMED), "several volumes are not made in slabs"),
 }
 """Options that several volumes, in time or of materials, do not go with."""
 
@@ -56,10 +56,7 @@ _PLANNED = {**_BY_BUDGET, "quality": "--quality chooses it"}
 _BY_SECONDS = {"follow": "it is for a finished scan; give --seconds"}
 _RUNNING = ("follow", "is for a scan that still runs: give --follow.")
 _IN_MEMORY = dict.fromkeys(("follow", "budget"), "such a run holds everything in memory")
-_PICTURE = {AXIS_TRIALS: "that writes a picture of slices, and nothing else"}
-_FOR_TIME = dict.fromkeys(
-    ("follow", "budget", "seconds", AXIS_TRIALS), "error bars need the whole scan, and time for refits"
-)
+_FOR_TIME = dict.fromkeys(("follow", "budget", "seconds"), "error bars need the whole scan, and time for refits")
 
 RULES: Mapping[str, OptionRule] = {
     "steps": OptionRule("steps", excludes={"seconds": "give one of them", **_PLANNED}),
@@ -81,18 +78,17 @@ RULES: Mapping[str, OptionRule] = {
     "allow-negative": OptionRule("allow_negative", excludes=_FINISHED),
     "time": OptionRule(
         "volumes",
-        excludes={
-            **_FINISHED,
-            AXIS_TRIALS: "find the axis first: give --axis try without --time, then its column with --time",
-            **OF_ONE_VOLUME,
-        },
+        excludes={**_FINISHED, **OF_ONE_VOLUME},
     ),
     "moves": OptionRule("moves", needs=("time", "is of volumes in time: give --time N with it.")),
     "plain-splatting": OptionRule("fit.rays.rectified", inverted=True, excludes=_BY_BUDGET),
     "uncertainty": OptionRule(value="uncertainty", excludes=_FOR_TIME),
     "truth": OptionRule(value="truth"),
     "follow": OptionRule(
-        excludes={SLABS_RESUMED: "these slabs are of a finished scan", AXIS_TRIALS: "trials of the axis need all views"}
+        value="follow",
+        excludes={
+            SLABS_RESUMED: "these slabs are of a finished scan",
+        },
     ),
     "earlier": OptionRule(needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts.")),
     "enough-loss": OptionRule(value="enough.psnr_loss", needs=_RUNNING),
@@ -105,12 +101,10 @@ RULES: Mapping[str, OptionRule] = {
         excludes={
             "follow": "it is for a finished scan",
             "truth": "a truth is compared with the whole volume",
-            AXIS_TRIALS: "trials of the axis draw whole slices",
         },
     ),
-    "log": OptionRule(excludes=_PICTURE),
     "dry-run": OptionRule(
-        excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time", **_PICTURE}
+        excludes={"follow": "a scan that runs takes its own time", "budget": "a budget sets the time"}
     ),
     SLABS_RESUMED: OptionRule(value="partial"),
 }
@@ -155,9 +149,21 @@ def contradiction(
     return ""
 
 
-def of_other_methods(rules: Mapping[str, OptionRule], given: Collection[str], method: str) -> str:
-    """Which option given is of other methods than this one; "" where none is."""
-    for name in (name for name, rule in rules.items() if name in given and rule.of_methods):
-        if method not in (owners := takers(rules[name])):
-            return f"--{name} is of {', '.join(owners)}; it does not go with --method {method}."
+def of_other_methods(
+    rules: Mapping[str, OptionRule], given: Collection[str], method: str, *, stated: bool = True
+) -> str:
+    """Which option given is of other methods than this one; "" where none is.
+
+    Args:
+        stated: somebody chose the method; else it is the default.
+    """
+    owners = {name: takers(rule) for name, rule in rules.items() if name in given and rule.of_methods}
+    for name, methods in owners.items():
+        if method in methods:
+            continue
+        what = f"it does not go with --method {method}." if stated else "give --method with one of these."
+        for other in () if stated else owners:
+            if not set(owners[other]) & set(methods):
+                what = f"--{other} is of {', '.join(owners[other])}. Give one of the two options."
+        return f"--{name} is of {', '.join(methods)}; {what}"
     return ""

@@ -9,22 +9,43 @@ from typing import Any
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.energy_scans import EnergyScans
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.output_paths import OutputPaths
-from beamline.reconstruct.region import Region, selection_around
+from beamline.reconstruct.region import AroundSample, Region, selection_around
+from beamline.reconstruct.several_scans import SeveralScans
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writer_lock import PATIENCE
 from beamline.storage.writers.partial_volume import can_become
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Method, PresetMethod
+from recon.base.settings_check import check_settings
 from recon.methods import has_setting, names, streams
 from recon.splatting.fit_method import StreamingMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
+
+
+@dataclass(frozen=True)
+class FollowTiming:
+    """How a scan is followed; all in s.
+
+    Attributes:
+        poll: between looks at the file while there is nothing to fit.
+        slice: of fitting between looks at the file.
+        snapshot: between intermediate volumes.
+        picture: between slices by FBP, at least; drawing them takes at most half of the time.
+        patience: without a new frame, before a file without the lock of its writer counts as one that died.
+    """
+
+    poll: float = 0.1
+    slice: float = 0.25
+    snapshot: float = 5.0
+    picture: float = 0.3
+    patience: float = PATIENCE
 
 
 @dataclass(frozen=True)
@@ -38,16 +59,18 @@ class ReconOptions:
         filter: of the FBP that the volume is compared with.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
+        follow: reconstruct a scan while it runs, so; None: it has ended.
         enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
-        cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
+        cluster: whose workers reconstruct slabs, see `workers.cluster`; None: this process does.
+        region: the box of the volume to make; None: all of it.
         partial: volume whose missing slabs are reconstructed; None begins anew.
         uncertainty: make the standard deviation of each voxel, too, see `recon.error_bars`.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """
 
-    source: SourceOptions | EnergyScans
+    source: SourceOptions | SeveralScans
     target: OutputPaths
     selection: Selection
     method: Method = field(default_factory=R2)
@@ -59,14 +82,18 @@ class ReconOptions:
     seed: int = 0
     truth: str | None = None
     unfinished: bool = False
+    follow: FollowTiming | None = None
     enough: Goal | None = None
     memory: int | None = None
-    region: Region | None = None
+    region: Region | AroundSample | None = None
     cluster: str | None = None
     partial: Path | None = None
     uncertainty: bool = False
     command: str = ""
     recipe: str = ""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
     @property
     def given(self) -> frozenset[str]:
@@ -82,13 +109,9 @@ class ReconOptions:
         }
         return frozenset(run | of_method | ({"time"} if self.method.traits.in_time else set()))
 
-    def refuse_contradictions(self, *also: str) -> None:
-        """Raises ConfigError for values that do not go together, or that the method would silently ignore.
-
-        Args:
-            also: options that no value here tells of, such as "follow".
-        """
-        given = self.given | set(also)
+    def refuse_contradictions(self) -> None:
+        """Raises ConfigError for values that do not go together, or that the method would silently ignore."""
+        given = self.given
         if why := contradiction(RULES, given, one_method=True) or of_other_methods(RULES, given, self.method.name):
             raise ConfigError(why)
 
@@ -110,14 +133,21 @@ class ReconOptions:
         return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:
-        """The same with the rows that show the region; the same options where all of the volume is wanted.
+        """The same with the rows that show the region, which is found where it is the one around the sample; the same
+        options where all of the volume is wanted.
 
         Raises:
-            ConfigError: see `region.selection_around`.
+            ConfigError, DataError: see `region.selection_around` and `sample_box.box_around_sample`.
         """
-        if self.region is None:
+        region = self.region
+        if region is None:
             return self
-        return replace(self, selection=selection_around(source, self.selection, self.region, self.method.traits.halo))
+        if isinstance(region, AroundSample):
+            from beamline.reconstruct.sample_box import box_around_sample
+
+            region = box_around_sample(source, self.selection)
+        selection = selection_around(source, self.selection, region, self.method.traits.halo)
+        return replace(self, selection=selection, region=region)
 
     @property
     def partial_path(self) -> Path:

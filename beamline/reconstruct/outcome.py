@@ -18,7 +18,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
-from beamline.storage.rules.validate import scan_ended
+from beamline.storage.rules.scan import scan_ended
 from drivers.base.frame import FrameKind
 from recon.methods import by_name
 from recon.voxels.fbp import Filter
@@ -40,6 +40,8 @@ class ScanFacts:
         shape: of a frame.
         columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
         ended: how the scan ended where it did not take all its frames, and why; empty: it did, or runs.
+        frames_per_view: that a view is the mean of.
+        live_picture: file name of the last picture of a volume that grew with its scan; empty: none did.
     """
 
     path: Path
@@ -53,6 +55,8 @@ class ScanFacts:
     shape: tuple[int, int] = (1, 1)
     columns: str = ""
     ended: str = ""
+    frames_per_view: int = 1
+    live_picture: str = ""
 
 
 @dataclass(frozen=True)
@@ -62,9 +66,7 @@ class ReportContext:
     Attributes:
         scan_flags: sentences of the monitor during the scan, where the reconstruction belongs to its run.
         filter: of FBP, also of the one that the volume is compared with.
-        chosen: what a budget, a preset or the data chose, in a line; empty where the settings were given.
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
-        live_picture: file name of the last picture of a volume that grew with its scan.
         leaves: whether there is time for so many seconds before the report.
         stray: the map of mass where views show nothing [y, x]; None without any.
         elapsed: seconds of the whole command until its report is drawn, 0 before.
@@ -79,13 +81,11 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
     region: RegionOfRows | None = None
-    live_picture: str = ""
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True
     stray: NDArray[np.float32] | None = None
     elapsed: float = 0.0
     filter: Filter = "hann"
-    chosen: str = ""
     psnr: Sequence[tuple[float, float]] = ()
 
 
@@ -130,7 +130,18 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     images = reference_images(source)
     ended = " ".join(finding.message for finding in scan_ended(source)) if source.finished else ""
     return ScanFacts(
-        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, columns, ended
+        source.path,
+        source.path.name,
+        sample,
+        table,
+        frames,
+        remarks,
+        flagged,
+        images,
+        source.shape,
+        columns,
+        ended,
+        source.frames_per_view,
     )
 
 

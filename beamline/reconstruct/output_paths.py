@@ -6,14 +6,12 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import REPORT, refuse_existing
 from beamline.core.text import size
-from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from recon.base.volume import Grid
 
@@ -27,14 +25,13 @@ def report_beside(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. `take` gets
-    the result before the file `output` is written. Where that is not to be `written`, its folder is only worked in.
+    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. Where the
+    file `output` is not to be `written`, its folder is only worked in.
     `names`: of volumes that get a file each, OUTPUT's stem + _NAME; empty: there is one file, `output` itself."""
 
     output: Path
     report: Path | None
     replace: bool = False
-    take: Callable[[ReconRecord], None] = lambda record: None
     written: bool = True
     names: tuple[str, ...] = ()
 

@@ -63,7 +63,7 @@ def compose(
         command=context.command,
         recipe=context.recipe,
         footnotes=_footnotes(made, truth, metrics, unexplained),
-        live_picture=context.live_picture,
+        live_picture=context.facts.live_picture,
     )
 
 
@@ -93,8 +93,8 @@ def _summary(
         summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
     if context.region is not None:
         summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
-    if context.chosen:
-        summary += f". Chosen: {context.chosen}"
+    if made.chosen:
+        summary += f". Chosen: {made.chosen}"
     if price := price_text(made):
         summary += f". The next dB: {price}"
     return summary + "."

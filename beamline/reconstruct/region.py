@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
@@ -21,11 +21,19 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Region:
-    """Voxels first:end along z, y and x of the whole volume by the same options."""
+    """Voxels first:end along z, y and x of the whole volume by the same options.
+
+    Attributes:
+        requested: somebody asked for this box, which is refused where it lies beyond the volume; else it was found, and
+            what lies beyond is cut off.
+        reason: a sentence on a box that was found.
+    """
 
     z: Span
     y: Span
     x: Span
+    requested: bool = True
+    reason: str = ""
 
     @classmethod
     def parse(cls, text: str) -> Region:
@@ -40,6 +48,11 @@ class Region:
 
     def __str__(self) -> str:
         return ",".join(f"{first}:{end}" for first, end in (self.z, self.y, self.x))
+
+
+@dataclass(frozen=True)
+class AroundSample:
+    """Stands for the box around the sample, which `sample_box.box_around_sample` finds where the scan is read."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +91,11 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     """
     if cone_of(source, selection) is not None:
         raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
-    calibrate, poses = selection.step(Calibrate), stated_poses(source, selection)
-    given = [f"--calibrate {term}" for term in calibrate.terms if term in ("roll", "tilt", "shifts")]
-    if poses is not None and (poses.shifts[:, 1].any() or poses.turns_deg.any()):
-        given.append("--poses along the axis, or with roll or tilt")
+    poses = stated_poses(source, selection)
+    moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
+    given = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
+    if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
+        given.append("--poses along the axis, or with roll, tilt or vectors")
     if given:
         raise ConfigError(
             f"--roi takes rows for slices, and by {' and '.join(given)} a row may show others. Give --rows instead of "
@@ -91,7 +105,8 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     slices = (rows.stop - rows.start) // side
     if end > slices:
         raise ConfigError(f"--roi {region}: slices {first}:{end} do not lie in the volume's 0:{slices}.")
-    _refuse_beyond(region, _widest(source, selection), "the widest volume's")
+    if region.requested:
+        _refuse_beyond(region, _widest(source, selection), "the widest volume's")
     low, high = max(first - halo, 0), min(end + halo, slices)
     near = rows.start + low * side, rows.start + high * side
     return replace(selection, rows=near, axis_rows=(rows.start, rows.stop))
@@ -106,6 +121,9 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     """
     assert selection.rows is not None and selection.axis_rows is not None
     grid, side = Grid.matching(geometry), selection.binning
+    if not region.requested:
+        n = grid.shape[2]
+        region = replace(region, y=(region.y[0], min(region.y[1], n)), x=(region.x[0], min(region.x[1], n)))
     low, high = ((row - selection.axis_rows[0]) // side for row in selection.rows)
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
     if not geometry.rows_show_slices:

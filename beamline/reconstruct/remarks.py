@@ -70,14 +70,18 @@ def not_begun_warning(made: Reconstruction, residual: float, uniform: float) -> 
     )
 
 
+_COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
+
+
 def hiding_warning(made: Reconstruction, structure: unexplained.Unexplained) -> str:
     """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
     if structure.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
         return ""
+    others = " and ".join(name for name in _COMPARED if name != made.method)
     return (
         f"{structure.share:.1%} of the matter leaves structure in the residual of the views (at most "
         f"{unexplained.LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
-        "at 'What the volume leaves in the views' in the report, and compare with --method fbp and fista-tv."
+        f"at 'What the volume leaves in the views' in the report, and compare with --method {others}."
     )
 
 

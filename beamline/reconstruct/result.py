@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +17,23 @@ from beamline.core.events import Sink, VolumeDone
 from beamline.core.files import remove
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
-from beamline.reconstruct.parameters import parameters_of
+from beamline.reconstruct.remarks import partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
-from beamline.storage.recon_record import ReconRecord, VolumeInFile
+from beamline.storage.pose_table import CENTRES_KEPT
+from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock
 from recon.base.method import Reconstruction
 from recon.base.volume import Volume
 from recon.methods import BASELINE
+from recon.prep.align import AxisEstimate
 
 
 def write_result(
@@ -40,8 +45,10 @@ def write_result(
     sink: Sink,
     clock: Clock,
     partial_volume: Path | None = None,
-) -> dict[str, float]:
-    """Judge the volume, write its file and the report, and send the event `done`. Returns the metrics.
+) -> ReconRecord:
+    """Judge the volume, write its file and the report, and send the event `done` with the record that is returned.
+
+    The record's voxels are read from the file where they are used; where no file is written it holds the volume.
 
     Args:
         partial_volume: the partial volume that becomes the output as it is; None: the volume is written.
@@ -69,7 +76,6 @@ def write_result(
             write_report(target.report, report, replace=target.replace)
             page = target.report
         phases.enter("writing the volume")
-        target.take(record)
         if partial_volume is not None:
             complete(partial_volume, record, target.output, replace=target.replace)
         elif target.written:
@@ -80,9 +86,9 @@ def write_result(
         raise
     phases.end()
     elapsed = clock.now() - context.started
-    record = replace(record, **_left_in_file(record, target), elapsed=elapsed, times=phases.seconds)
+    record = _light(replace(record, elapsed=elapsed, times=phases.seconds), target)  # to replace it reads its voxels
     sink(VolumeDone(record, time=clock.now()))
-    return dict(record.metrics)
+    return record
 
 
 def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
@@ -111,7 +117,7 @@ def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[Re
         compared=judged.metrics.get(BASELINE) if len(judged.metrics) > 1 else None,
         warnings=tuple(judged.warnings),
         hiding=judged.hiding,
-        chosen=context.chosen,
+        chosen=made.chosen,
         next_decibel=price_of_decibel(made),
         next_decibel_text=price_text(made),
         output=target.outputs[0],
@@ -152,43 +158,125 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
         )
 
 
-def _left_in_file(record: ReconRecord, target: OutputPaths) -> dict[str, Any]:
-    """Fields of a record that holds no voxels and no open file until they are used: all are in the file alone."""
+def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
+    """The record without what its files hold, or, where none is written, with no more than its volumes."""
+    volume, series = record.volume, record.series
+    if target.written:
+        at = None if target.names or series is None else 0
+        voxels: Any = VoxelsInFile(volume.grid.shape, partial(_voxels, target.outputs[0], at))
+        volume = replace(volume, data=voxels)
+        if series is not None:
+            series = replace(series, data=VoxelsInFile(series.data.shape, partial(_some_volumes, target.outputs)))
+    else:
+        volume = replace(volume, data=np.array(volume.data))  # it may lie in a temporary file
+    return replace(record, volume=volume, series=series, deviation=None, fbp=None, model={})
 
-    def read() -> Volume:
-        with opened_volume(target.outputs[0], at=None if target.names or record.series is None else 0) as stored:
-            return replace(stored.volume, data=np.array(stored.volume.data[:]))
 
-    series = record.series
-    if series is not None and target.written:
-        series = replace(series, data=_VolumesInFiles(target.outputs, series.data.shape))
-    return {"volume": VolumeInFile(record.grid, read), "series": series, "deviation": None, "fbp": None, "model": {}}
+def _voxels(path: Path, at: int | None, part: Any) -> NDArray[np.float32]:
+    """Part [z, y, x] of the volume of a file, or of its volume number `at`."""
+    with opened_volume(path, at=at) as stored:
+        return np.array(stored.volume.data[part])
 
 
-@dataclass(frozen=True)
-class _VolumesInFiles:
-    """Volumes [volume, z, y, x] of one file, or of a file each, which are opened where they are used."""
+def _some_volumes(paths: Sequence[Path], part: Any) -> NDArray[np.float32]:
+    """Part [volume, z, y, x] of the volumes of one file, or of a file each."""
+    if len(paths) == 1:
+        return _dataset(paths[0], part)
+    which, *within = part if isinstance(part, tuple) else (part,)
+    numbers = range(len(paths))[which]
+    if isinstance(numbers, int):
+        return _dataset(paths[numbers], tuple(within))
+    return np.stack([_dataset(paths[n], tuple(within)) for n in numbers])
 
-    paths: tuple[Path, ...]
-    shape: tuple[int, ...]
 
-    @property
-    def dtype(self) -> np.dtype[np.float32]:
-        return np.dtype(np.float32)
+def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        return np.asarray(file["entry/data/data"][part])
 
-    def __getitem__(self, part: Any) -> NDArray[np.float32]:
-        if len(self.paths) == 1:
-            return self._read(self.paths[0], part)
-        which, *within = part if isinstance(part, tuple) else (part,)
-        numbers = np.arange(self.shape[0])[which]
-        if numbers.ndim == 0:
-            return self._read(self.paths[numbers], tuple(within))
-        return np.stack([self._read(self.paths[n], tuple(within)) for n in numbers])
 
-    @staticmethod
-    def _read(path: Path, part: Any) -> NDArray[np.float32]:
-        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-            return np.asarray(file["entry/data/data"][part])
+def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
+    """All parameters of the volume, by name."""
+    selection, geometry = context.selection, prepared.geometry
+    rows = selection.rows
+    return {
+        "method": made.method,
+        "axis_col": prepared.axis_col,
+        **_axis_parameters(prepared.axis),
+        "views": selection.views,
+        "view_frames": prepared.projections.view_ids,
+        "view_angles_deg": np.degrees(geometry.angles),
+        "n_views": geometry.n_views,
+        "n_projections": prepared.n_projections,
+        "views_left_out": prepared.left_out,
+        **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
+        "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
+        **_region_parameters(context),
+        **({"frames_per_view": context.facts.frames_per_view} if context.facts.frames_per_view > 1 else {}),
+        **({"columns": context.facts.columns} if context.facts.columns else {}),
+        **({"scan_ended": context.facts.ended} if context.facts.ended else {}),
+        "binning": selection.binning,
+        "pixel_pitch": geometry.pixel_pitch,
+        "pixel_pitch_unit": prepared.length_unit,
+        "quantity": prepared.quantity,
+        **prepared.recorded,
+        **(done := recorded(in_order(selection), prepared.done)),
+        **({"view_shifts_px": geometry.shifts} if "jumps" in done or geometry.shifts.any() else {}),
+        **({"slices_partly_seen": few} if (few := partly_seen(geometry)).size else {}),
+        **({"view_roll_deg": np.degrees(geometry.roll)} if geometry.roll.any() else {}),
+        **({"view_tilt_deg": np.degrees(geometry.tilt)} if geometry.tilt.any() else {}),
+        **({CENTRES_KEPT: geometry.centres} if geometry.centres.any() else {}),
+        **({} if geometry.is_straight and not geometry.shifts.any() else {"sample_pitch": geometry.sample_pitch}),
+        "floored_fraction": float(prepared.projections.floored),
+        "masked_fraction": float(prepared.projections.masked.mean()),
+        "replaced_fraction": float(prepared.projections.replaced),
+        "filter": context.filter,
+        "seed": context.seed,
+        **_flat("", made.settings),
+        **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
+        "command": context.command,
+        **({"recipe": context.recipe} if context.recipe else {}),
+    }
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.asarray(self[:], dtype)
+
+def _region_parameters(context: ReportContext) -> dict[str, Value]:
+    if context.region is None:
+        return {}
+    box = context.region.region
+    return {"roi": str(box), **({"roi_found": box.reason} if box.reason else {})}
+
+
+def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
+    """Nested settings by joined names; values without an HDF5 type become text."""
+    out: dict[str, Value] = {}
+    for key, value in values.items():
+        name = f"{prefix}_{key}" if prefix else key
+        if isinstance(value, Mapping):
+            out |= _flat(name, value)
+        else:
+            out[name] = value if isinstance(value, int | float | np.ndarray) else str(value)
+    return out
+
+
+def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
+    if axis is None:
+        return {"axis_source": "given, or stated in the file"}
+    return {
+        "axis_source": axis.method,
+        "axis_confident": axis.confident,
+        "axis_binned": axis.value,
+        "axis_candidates": axis.candidates,
+        "axis_curve": axis.curve,
+    }
+
+
+def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
+    """How the axis was found, from the parameters of a reconstruction; None if it was given."""
+    if "axis_curve" not in parameters:
+        return None
+    return AxisEstimate(
+        value=float(str(parameters["axis_binned"])),
+        candidates=np.asarray(parameters["axis_candidates"]),
+        curve=np.asarray(parameters["axis_curve"]),
+        confident=bool(parameters["axis_confident"]),
+        method=str(parameters["axis_source"]),
+    )

@@ -19,7 +19,7 @@ from beamline.core.shipped import version
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
-from beamline.reconstruct.needs import for_part
+from beamline.reconstruct.memory import for_part
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial

@@ -16,12 +16,10 @@ from beamline.core.text import size
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import cone_of
-from beamline.reconstruct.energy_scans import EnergyScans
-from beamline.reconstruct.energy_views import prepare_energies, repeated, views_of_others
-from beamline.reconstruct.needs import (
-    Needs,
+from beamline.reconstruct.memory import (
+    ReconMemory,
     memory_of,
-    needs_of,
+    recon_memory_of,
     refuse_few_views,
     refuse_slabs,
     refuse_smallest,
@@ -29,7 +27,8 @@ from beamline.reconstruct.needs import (
     surely_weighted,
 )
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.region import locate
+from beamline.reconstruct.region import Region, locate
+from beamline.reconstruct.several_scans import SeveralScans, views_of_others, with_as_many_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
@@ -54,7 +53,7 @@ def disk_buffer_of(
     if cone_of(source, options.selection) is not None:
         return None
     try:
-        needs = needs_of(source, options)
+        needs = recon_memory_of(source, options)
     except ConfigError:
         return None  # faults of the views come first; reading them reports these
     memory = memory_of(options)
@@ -95,10 +94,10 @@ def prepare_within(
     others = views_of_others(options.source, options.selection)
 
     def check(geometry: Geometry) -> None:
-        if options.region is not None:
+        if isinstance(options.region, Region):
             locate(options.region, options.selection, geometry)
         if options.method.traits.several:
-            needs = Needs(options.method, repeated(geometry, geometry.n_views + others), 0, True)
+            needs = ReconMemory(options.method, with_as_many_views(geometry, geometry.n_views + others), 0, True)
             refuse_few_views(source, options, needs.geometry)
             if needs.at_once > memory:
                 refuse_whole(source, options, needs, memory)
@@ -108,8 +107,8 @@ def prepare_within(
                 "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
             )
 
-    if isinstance(options.source, EnergyScans):
-        return prepare_energies(options.source, options.selection, warn, check, phases), []
+    if isinstance(options.source, SeveralScans):
+        return options.source.prepare(options.selection, warn, check, phases), []
     prepared = prepare_projections(source, options.selection, warn, buffer, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if method.traits.in_time:
@@ -117,11 +116,11 @@ def prepare_within(
     if buffer is None:
         if options.partial is not None:
             raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
-        needs = Needs(method, geometry, 0, not method.traits.direct, bars=options.uncertainty)
+        needs = ReconMemory(method, geometry, 0, not method.traits.direct, bars=options.uncertainty)
         _refuse_wider(source, prepared, needs, memory)
         return prepared, []
     weighted = not method.traits.direct and (prepared.ray_factors() is not None or prepared.shares_of is not None)
-    needs = Needs(method, geometry, 0, weighted, bars=options.uncertainty)
+    needs = ReconMemory(method, geometry, 0, weighted, bars=options.uncertainty)
     refuse_smallest(source, needs, memory, options.selection.binning)
     if options.partial is None:
         return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
@@ -140,7 +139,7 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     return np.asarray(view_ids * float(period), np.float64)
 
 
-def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Needs, memory: int) -> None:
+def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: ReconMemory, memory: int) -> None:
     """Raises DataError if a volume does not fit after all, because its axis was found near an edge."""
     if needs.geometry.is_cone or prepared.axis is None or needs.at_once <= memory:
         return

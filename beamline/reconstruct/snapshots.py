@@ -1,9 +1,9 @@
-"""Snapshots of a growing volume: a file and a picture, each replacing the last in one step."""
+"""Snapshots of a growing volume, and slices of its views: a file and a picture, each replacing the last in one step."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -11,11 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
+from beamline.projections.correction import ScanCorrection
+from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
 from beamline.storage.readers.base import ScanSource
@@ -24,9 +27,11 @@ from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
 from recon.base.noise import noise_level
+from recon.base.views import spread
 from recon.base.volume import Volume
+from recon.prep.correct import Projections
 from recon.splatting.stream import StreamingFit
-from recon.voxels.slices import OrthogonalSlices
+from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
 
 if TYPE_CHECKING:
     from matplotlib.colors import LinearSegmentedColormap
@@ -250,3 +255,58 @@ def _means(image: F32, step: int) -> F32:
     each = min(step, image.shape[0]), min(step, image.shape[1])
     cut = image[: rows * each[0], : cols * each[1]]
     return cut.reshape(rows, each[0], cols, each[1]).mean(axis=(1, 3))
+
+
+_FEWEST, _BEFORE_AXIS = 8, 32  # views; of them, those that are corrected before the axis is known
+_WHOLE = 1.0  # degrees of the half turn that may be missing
+
+
+class LiveSlices:
+    """Draws the slices when there are new views and enough time has passed; drawing takes at most half of the time."""
+
+    def __init__(self, views: FollowedViews, snapshots: Snapshots, clock: Clock) -> None:
+        self._views, self._snapshots, self._clock = views, snapshots, clock
+        self._newest, self._next = -1, -math.inf  # the last view drawn; the time from which they are drawn again
+
+    def draw(self, parts: Sequence[Projections], axis_col: float | None, pause: float | None, of: int = 0) -> None:
+        """Draw slices of corrected views about the axis (a column of the file; None: the middle of the detector).
+
+        Views of a cone, or that lean or climb, have no slices.
+
+        Args:
+            pause: s until they are drawn again, at least; None: they are drawn now.
+            of: number of views so far; 0 where `parts` holds all of them.
+        """
+        n, begin = sum(part.view_ids.size for part in parts), self._clock.now()
+        if n < _FEWEST or (pause is not None and begin < self._next) or int(parts[-1].view_ids[-1]) == self._newest:
+            return
+        ids = np.concatenate([part.view_ids for part in parts])
+        col = (self._views.source.shape[1] - 1) / 2 if axis_col is None else axis_col
+        geometry, _ = self._views.geometry(col, ids)
+        with suppress(ValueError):
+            slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
+            count = f"{n} of {of}" if of > n else str(n)
+            place = "the middle, not known yet" if axis_col is None else f"column {col:.1f}"
+            coverage = _coverage(math.degrees(slices.covered), geometry.angles)
+            heading = f"FBP of {count} views so far{coverage}, axis at {place}"
+            self._snapshots.write_slices(slices, n, heading)
+        end = self._clock.now()
+        self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
+
+    def draw_about_middle(self, correction: Callable[[], ScanCorrection], pause: float | None) -> None:
+        """Draw slices before the axis is known, of some of the views, corrected for this alone."""
+        views = self._views.chosen(self._views.usable().frames)
+        early = pause is not None and self._clock.now() < self._next
+        if views.size < _FEWEST or early or int(views[-1]) == self._newest:
+            return
+        with suppress(DataError):  # views without light, say: the scan goes on, and so does the fit
+            self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
+
+
+def _coverage(degrees: float, angles: NDArray[np.float64]) -> str:
+    """What a heading says where the views leave a wedge out."""
+    if degrees > 180 - max(_WHOLE, 1.5 * degrees / angles.size):
+        return ""
+    steps = np.diff(angles)
+    order = "sequential: " if (steps > 0).all() or (steps < 0).all() else ""
+    return f", {order}{degrees:.0f} of 180 degrees so far"

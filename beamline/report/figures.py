@@ -191,7 +191,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     voxel. So single noisy voxels are no edges.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.ticker import MaxNLocator, NullFormatter
 
     last = list(volumes.values())[-1].data
     z = bright_centre(last)[0]
@@ -215,6 +215,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
     right.set(xlabel=kind.label(unit), ylabel="share of voxels", yscale="log")
     right.set_title("Values", fontsize=9)
+    right.yaxis.set_minor_formatter(NullFormatter())  # which ticks of a decade to name takes long, and none is named
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=7)

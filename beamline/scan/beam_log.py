@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable
 from typing import Self
 
-from beamline.config.devices import BeamMonitorConfig, NoBeamMonitor
+from beamline.config.beam import NoBeamMonitor
+from beamline.config.devices import BeamMonitorConfig
 from beamline.core.events import BeamRead, Sink, Warned
 from beamline.core.stop import PauseRequest
 from beamline.core.text import count

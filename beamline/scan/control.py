@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -25,10 +26,9 @@ from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 
-POSIX = os.name == "posix"  # the system has owners and modes, and can hold a folder open
 POLL = 0.1  # real s between checks
-_ANSWER = 5.0  # real s within which a scan accepts a verb
-_EFFECT = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
+ANSWER_WITHIN = 5.0  # real s within which a scan accepts a verb
+EFFECT_WITHIN = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
 
 
 class Verb(StrEnum):
@@ -46,7 +46,7 @@ class _Requests:
     def __init__(self, folder: Path) -> None:
         folder.mkdir(mode=0o700)
         self._folder, self._held = folder, -1
-        if POSIX:
+        if sys.platform != "win32":
             self._held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             os.fchmod(self._held, 0o700)
 
@@ -70,7 +70,7 @@ class _Requests:
             os.unlink(verb, dir_fd=self._held)
         except OSError:
             return False
-        return stat.S_ISREG(made.st_mode) and made.st_uid in (os.geteuid(), 0)
+        return stat.S_ISREG(made.st_mode) and made.st_uid in (_user(), 0)
 
     def close(self) -> None:
         """Remove the remaining requests, and the folder."""
@@ -82,11 +82,18 @@ class _Requests:
             self._folder.rmdir()
 
 
+def _user() -> int:
+    """The number of the user whose rights this process has; 0 on Windows, whose files name none."""
+    if sys.platform == "win32":
+        return 0
+    return os.geteuid()
+
+
 def _not_private(folder: os.stat_result) -> str:
     """Why somebody else may have made requests there; "" if only we can."""
     if not stat.S_ISDIR(folder.st_mode):
         return "it is no folder of its own"
-    if os.geteuid() not in (folder.st_uid, 0):
+    if _user() not in (folder.st_uid, 0):
         return f"it belongs to the user {folder.st_uid}"
     if folder.st_mode & 0o022:
         return f"others may write to it (mode {stat.S_IMODE(folder.st_mode):03o})"
@@ -130,7 +137,7 @@ def verbs_taken(
         yield
     finally:
         over.set()
-        thread.join(_ANSWER)
+        thread.join(ANSWER_WITHIN)
         requests.close()
 
 
@@ -165,7 +172,7 @@ class Asked:
         """
         request, seconds = self.part / CONTROL / self.verb, time.monotonic() - self.since
         if request.exists():
-            if seconds < _ANSWER:
+            if seconds < ANSWER_WITHIN:
                 return None
             if _taken(request):
                 raise ConfigError(
@@ -173,7 +180,7 @@ class Asked:
                     "it has died, look at the instrument, and run `beamline recover` on its file."
                 )
         state = state_of(self.part)
-        return state if _done(state, self.verb) or seconds > _EFFECT else None
+        return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None
 
 
 def ask(run: Path, verb: Verb) -> Asked:
@@ -189,7 +196,7 @@ def ask(run: Path, verb: Verb) -> Asked:
         folder = os.lstat(request.parent)
     except OSError:
         raise ConfigError(f"no scan runs in {run}. Nothing was changed.") from None
-    if POSIX and (fault := _not_private(folder)):
+    if sys.platform != "win32" and (fault := _not_private(folder)):
         raise ConfigError(
             f"{request.parent}: {fault}. Only who started a scan can tell it something. Nothing was changed."
         )

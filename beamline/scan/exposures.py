@@ -334,7 +334,7 @@ class Exposures:
         patience = PATIENCE + block.exposure + self._camera.timing.readout
         position = self._stage.position()
         triggered, silent = -math.inf, 0
-        owed, i, tried = self._stop.stopping, -1, Counter[int]()
+        owed, i, tried, stands_at = self._stop.stopping, -1, Counter[int](), math.nan
         while (after := self._after_pause(i + 1, block, taken)) < block.n:
             if after <= i or tried[after]:
                 self._arm_anew(block.n - after)
@@ -343,8 +343,9 @@ class Exposures:
             if self._stop.stopping and not owed:
                 break
             if math.isfinite(angle):
-                if not (self.go(angle) and self._rest(self._settle, owed)):
+                if angle != stands_at and not (self.go(angle) and self._rest(self._settle, owed)):
                     break
+                stands_at = angle
                 position = self._stage.position()
             if not self._rest(triggered + period - self._clock.now(), owed):
                 break
@@ -358,6 +359,7 @@ class Exposures:
                 yield frame, i, position, not wrong
                 if wrong:
                     tried[i] += 1
+                    stands_at = math.nan
                     if len(taken.astray) == tried[i] == 1:
                         self._sink(Warned(f"View {i}: {wrong}"))
                     if tried[i] == TRIES:

@@ -93,7 +93,7 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
         remark = "Only darks and flats are taken: the volume is made of joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
     _, camera, _ = describe(config)
-    plan = live_plan(camera.shape, plan_of(config).angles.size, free_memory())
+    plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
     return Commands(live=follow_command(config, plan, series.parts if series else ()))
 
 

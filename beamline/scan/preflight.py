@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamline.config.devices import NoBeamMonitor
+from beamline.config.beam import NoBeamMonitor
 from beamline.config.load import Config, at_energies, camera_settings, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
@@ -166,7 +166,7 @@ def _worked(
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or method == AUTO or not streams(method):
         return worked
-    return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, worked.views.n, free_memory())))
+    return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, plan.n_views, free_memory())))
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
@@ -256,7 +256,8 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
         saturation=_saturation(timing),
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
-        step=usual_step(np.radians(np.degrees(plan.angles))),  # as the file states them
+        step=usual_step(np.radians(np.degrees(plan.angles[:: plan.frames_per_view]))),  # as the file states them
+        frames_per_view=plan.frames_per_view,
         stored=plan.stored,
         cone=info.source_distance_mm is not None,
         axis_col=info.axis_col,
@@ -277,6 +278,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "settle_s": plan.settle,
         "warm_up_s": plan.warm_up,
         "return_views": plan.return_views,
+        **({"frames_per_view": plan.frames_per_view} if plan.frames_per_view > 1 else {}),
         "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
         "angles_deg": np.degrees(plan.angles).tolist(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -51,7 +51,7 @@ from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
 from drivers.manual import Ask
 from drivers.stages.shared import FOUND
 
@@ -99,56 +99,66 @@ def run_scan(
             the file; the event `scan_done` says how much, and `failed` why.
     """
     if config.scan.energies is not None:
-        raise ConfigError(
-            "scan.energies asks for several scans, and this runs one: set scan.energy. Nothing was started."
-        )
+        raise ConfigError("scan.energies asks for several scans, this runs one: set scan.energy. Nothing was started.")
     began = time.monotonic()
     stop = stop or StopRequest()
     series = runs if isinstance(runs, ResumableRun) else None
     place = runs.run if isinstance(runs, ResumableRun) else runs or Path(config.storage.folder)
-    clock = None
-    if series and config.simulation is not None:  # a simulated clock starts anew in each process
-        clock = clock_of(config.simulation.clock, not_before=series.last_frame_time)
     with ExitStack() as connected:
-        instrument = instrument or connected.enter_context(
-            connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
-        )
+        if instrument is None:
+            devices = connect(config, clock=_clock(config, series), ask=ask, check_stop=lambda: _refuse_stop(stop))
+            instrument = connected.enter_context(devices)
         instrument.watch_moves(stop.refuse_abort)
         still = series.remaining if series else all_of
         ready = preflight(config, instrument, place, still, check_stop=lambda: _refuse_stop(stop))
         _refuse_stop(stop)
-        others = [] if series else other_devices(place, ready)
+        remarks = [*_settings_before(ready), *([] if series else other_devices(place, ready))]
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
-            try:
-                (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
-                events = stack.enter_context(new_log(folder / EVENTS))
-                log = stack.enter_context(new_log(folder / USER_LOG))
-            except OSError as error:
-                raise DataError(
-                    f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
-                ) from error
-            sink = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            for device, description in ready.info.devices.items():
-                if found_settings := description.get(FOUND):
-                    sink(Warned(f"{device}: before it was opened: {found_settings}."))
-            for sentence in others:
+            sink = stack.enter_context(Announcer([*_logs(config, folder, stack), *sinks], instrument.clock))
+            for sentence in remarks:
                 sink(Warned(sentence))
             run = _Run(config, instrument, ready, folder, stop, sink, began, series)
             stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
-                guarded.enter_context(
-                    watched(folder, sink, stop, run.pause if config.scan.without_watchdog == "pause" else None)
-                )
+                pause = run.pause if config.scan.without_watchdog == "pause" else None
+                guarded.enter_context(watched(folder, sink, stop, pause))
             guarded.callback(connected.close)
             return run.go(live, afterwards, release=guarded.close)
+
+
+def _settings_before(ready: ReadyScan) -> Iterator[str]:
+    """What each device had been set to before it was opened, where that was not as it should be."""
+    for device, description in ready.info.devices.items():
+        if settings := description.get(FOUND):
+            yield f"{device}: before it was opened: {settings}."
+
+
+def _logs(config: Config, folder: Path, stack: ExitStack) -> tuple[Sink, Sink]:
+    """The run's events.jsonl and user.log, open until the stack closes; the configuration is written beside them."""
+    try:
+        (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+        events = stack.enter_context(new_log(folder / EVENTS))
+        log = stack.enter_context(new_log(folder / USER_LOG))
+    except OSError as error:
+        raise DataError(
+            f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
+        ) from error
+    return JsonLines(events), UserLog(log)
 
 
 def _named(config: Config) -> str:
     """The end of a run folder's name."""
     energy = config.scan.energy
     return config.sample.name if energy is None else f"{config.sample.name}_{energy:.7g}keV"
+
+
+def _clock(config: Config, series: ResumableRun | None) -> Clock | None:
+    """A clock that goes on where the simulated one of the run stopped, as it starts anew in each process; else None."""
+    if series is None or config.simulation is None:
+        return None
+    return clock_of(config.simulation.clock, not_before=series.last_frame_time)
 
 
 def _refuse_stop(stop: StopRequest) -> None:
@@ -391,7 +401,7 @@ class _Run:
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.sink,
             Supervision(
-                lambda: self._refusal(recorder, follower), self.pause, lambda: _wait_in_pause(recorder), self.states,
+                lambda: self._refusal(recorder, follower), self.pause, lambda: wait_in_pause(recorder), self.states,
                 lambda missing: self._retakes(recorder, missing),
                 lambda: beam.wait_for_reading(lambda: self.stop.stopping),
             ),
@@ -439,7 +449,7 @@ class _Run:
         return chosen
 
 
-def _wait_in_pause(recorder: Recorder) -> bool:
+def wait_in_pause(recorder: Recorder) -> bool:
     """Wait a moment, while paused, and look whether the disk works; whether Enter was pressed at the terminal."""
     time.sleep(PAUSE_POLL)
     recorder.check()

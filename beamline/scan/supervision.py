@@ -195,4 +195,4 @@ class AlarmReaction:
             case Policy.PAUSE:
                 self._pause.pause(reason)
             case Policy.STOP if not self._stop.stopping:
-                self._stop.stop(reason)
+                self._stop.stop(reason, by_itself=True)

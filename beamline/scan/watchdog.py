@@ -25,17 +25,17 @@ from pathlib import Path
 
 import psutil
 
-from beamline.config.devices import EpicsShutter, Simple
+from beamline.config.devices import Simple
 from beamline.config.load import Config, load
-from beamline.config.monochromator import EpicsMonochromator
+from beamline.config.monochromator import FoundMonochromator
 from beamline.config.places import MotorSection
+from beamline.config.shutters import FoundShutter
 from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.base.clock import Clock, SystemClock
-from drivers.epics.devices import PvShutter
 from drivers.stages.shared import FOUND
 
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
@@ -48,7 +48,7 @@ UNANSWERED = (
 FROZEN = 60.0  # s without one, after which a scan counts as dead
 AGAIN = 3  # most watchdogs that are started as replacements
 ACTED = 70  # exit code of a watchdog that has made the instrument safe
-_STDOUT = 1  # written without a buffer, which could not be flushed at the end of the process
+STDOUT = 1  # written without a buffer, which could not be flushed at the end of the process
 COMMAND = (sys.executable, "-m", "beamline.scan.watchdog")
 INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=beamline", "--why=A scan runs", "cat")
 
@@ -158,7 +158,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed. `say`: takes a sentence
     on each step."""
     stage, shutter = config.devices.stage, config.devices.shutter
-    apart = shutter if isinstance(shutter, EpicsShutter) else None
+    apart = shutter if isinstance(shutter, FoundShutter) else None
     closed = "the shutter is moved by hand"
     if not isinstance(shutter, Simple):
         closed = "its shutter is closed" if apart is None else "the shutter has a step of its own"
@@ -176,13 +176,13 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
 
     done = [_insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
     if apart:
-        done.append(_insist(lambda: PvShutter(apart.pvs, clock).close(), clock, say, "The shutter is closed."))
+        done.append(_insist(lambda: apart.connect(clock).close(), clock, say, "The shutter is closed."))
     for name, device in (("sample mover", config.devices.sample_mover), ("filter", config.devices.filter)):
         if isinstance(device, MotorSection):
             halt = partial(device.stage.halt, clock)
             done.append(_insist(halt, clock, say, f"The {name} was told to stop."))
     monochromator = config.devices.monochromator
-    if isinstance(monochromator, EpicsMonochromator) and monochromator.stop_pv is not None:
+    if isinstance(monochromator, FoundMonochromator) and monochromator.stops:
         done.append(_insist(partial(monochromator.halt, clock), clock, say, "The monochromator was told to stop."))
     done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))
     return all(done)
@@ -253,7 +253,7 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
     def signs() -> int | None:
         with suppress(OSError):  # the scan has died; perhaps before this process was there
-            os.write(_STDOUT, b"watching\n")
+            os.write(STDOUT, b"watching\n")
         return None if life.ended else life.signs
 
     frozen = until_dead(signs, clock)

@@ -248,8 +248,10 @@ def never_close(file: h5py.File) -> None:
 def _lead_to_memory(handle: int, inode: int) -> None:
     with suppress(OSError):
         if os.fstat(handle).st_ino == inode:
-            memory = os.memfd_create("closed") if sys.platform == "linux" else os.open(os.devnull, os.O_RDWR)
-            os.dup2(memory, handle)
+            if sys.platform == "linux":
+                os.dup2(os.memfd_create("closed"), handle)
+            else:
+                os.dup2(os.open(os.devnull, os.O_RDWR), handle)
 
 
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types

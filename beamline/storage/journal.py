@@ -76,7 +76,7 @@ class FileChanges:
             with suppress(OSError):
                 journal.unlink(missing_ok=True)
             raise DataError(f"{journal} cannot be written ({_why(error)}). {self.path} is as it was.") from error
-        _apply(self, journal)
+        apply_changes(self, journal)
 
 
 def journal_of(path: Path) -> Path:
@@ -114,14 +114,14 @@ def finish(path: Path) -> bool:
     """
     journal = journal_of(path)
     if (changes := pending(path)) is not None:
-        _apply(changes, journal)
+        apply_changes(changes, journal)
     for left in journal.parent.glob(f".{journal.name}.*.partial"):  # of a program that was killed while it wrote it
         with suppress(OSError):
             left.unlink()
     return changes is not None
 
 
-def _apply(changes: FileChanges, journal: Path) -> None:
+def apply_changes(changes: FileChanges, journal: Path) -> None:
     path, longer = changes.path, False
     before = path.stat().st_size
     try:

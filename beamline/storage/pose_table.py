@@ -1,10 +1,12 @@
-"""PoseTable: displacement, roll and tilt of each view, from a CSV, from a volume of ours or from an NXtomo file."""
+"""PoseTable: displacement, roll and tilt of each view, or its vectors, from a CSV, .npz, a volume or an NXtomo file."""
 
 from __future__ import annotations
 
 import csv
 import io
 import re
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,6 +22,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F64
+from recon.base.vectors import geometry_of_vectors
 
 Key = Literal["frame", "view", "angle_deg"]
 IGNORE = "ignore"  # In place of a file: views count as not displaced, whatever their scan file says
@@ -27,6 +30,11 @@ _KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
 _FOR_PEOPLE = "shift_col_mm", "shift_row_mm"
+_VECTORS = {
+    cone: tuple(f"{vector}_{axis}" for vector in (first, "d", "u", "v") for axis in "xyz")
+    for cone, first in ((False, "ray"), (True, "src"))
+}
+_ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and whether they are of a cone
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
 _HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
@@ -46,6 +54,8 @@ class PoseTable:
         unit: "px" of the unbinned detector, or "mm" at the sample.
         frames: of the scan that the file was made with; None: not known.
         axis_col: of the volume that the poses are of, in columns of the whole detector; None: not known.
+        vectors: float64 [row, 12] in mm, as of `recon.base.vectors`, which state all of the geometry; None: no such.
+        cone: the vectors are of a cone.
     """
 
     path: Path
@@ -57,6 +67,13 @@ class PoseTable:
     unit: Literal["px", "mm"] = "px"
     frames: int | None = None
     axis_col: float | None = None
+    vectors: F64 | None = None
+    cone: bool = False
+
+    @property
+    def leans(self) -> bool:
+        """A row of a view may show several slices."""
+        return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
         return str(self.path)
@@ -96,6 +113,8 @@ def read_poses(text: str) -> PoseTable:
     try:
         if hdf5.is_hdf5(path):
             return _of_hdf5(path, (match[2], match[3]) if match else None)
+        if zipfile.is_zipfile(path):
+            return _of_arrays(path)
         return _of_csv(path, text_in(path, _LARGEST))
     except _NoPosesError as error:
         raise ValueError(str(error)) from error
@@ -107,11 +126,14 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     lines = [line for line in content.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     rows = list(csv.reader(lines))
     names = [name.strip().lower() for name in rows[0]] if rows else []
-    legal = (*_KEYS, *_PIXELS, *_TURNS, *_FOR_PEOPLE)
-    if not set(names) & set(_KEYS) or not set(names) & {*_PIXELS, *_TURNS}:
+    of_vectors = {cone: columns for cone, columns in _VECTORS.items() if columns[0] in names}
+    stated = next(iter(of_vectors.values()), (*_PIXELS, *_TURNS))
+    legal = (*_KEYS, *stated, *(() if of_vectors else _FOR_PEOPLE))
+    missing = [name for name in stated if name not in names]
+    if not set(names) & set(_KEYS) or (missing if of_vectors else len(missing) == len(stated)):
         raise ValueError(
             f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"some of {', '.join((*_PIXELS, *_TURNS))}"
+            f"{'all' if of_vectors else 'some'} of {', '.join(stated)}"
         )
     unknown = [name for name in names if name not in legal]
     if unknown or len(set(names)) < len(names):
@@ -136,9 +158,37 @@ def _of_csv(path: Path, content: str) -> PoseTable:
         if bad.any():
             kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
             raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
+    for cone, vectors in of_vectors.items():
+        return _of_vectors(path, by, keys, np.stack([columns[name] for name in vectors], axis=1), cone=cone)
     none = np.zeros(len(values))
     shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
     return PoseTable(path, by, keys, angles, shifts, turns)
+
+
+def _of_arrays(path: Path) -> PoseTable:
+    """Vectors of all views, in an .npz under the name that ASTRA has for their kind."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            read = {name: np.asarray(arrays[name]) for name in arrays.files if name in _ARRAYS}
+            names = arrays.files
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read ({error})") from error
+    if len(read) != 1:
+        raise ValueError(f"{path} holds {', '.join(names)}; expected one of {' and '.join(_ARRAYS)}")
+    ((name, vectors),) = read.items()
+    if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
+        raise ValueError(f"{path}: {name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")
+    keys = np.arange(len(vectors), dtype=np.float64)
+    return _of_vectors(path, "view", keys, vectors.astype(np.float64), cone=_ARRAYS[name])
+
+
+def _of_vectors(path: Path, by: Key, keys: F64, vectors: F64, *, cone: bool) -> PoseTable:
+    try:
+        views = geometry_of_vectors(vectors, (1, 1), cone=cone)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    turns = np.degrees(np.stack((views.roll, views.tilt), axis=1))
+    return PoseTable(path, by, keys, None, np.zeros((len(keys), 2)), turns, vectors=vectors, cone=cone)
 
 
 def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
@@ -156,12 +206,17 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
     )
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
         raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
+    if CENTRES_KEPT in parameters:
+        raise ValueError(f"{path} was made with vectors of each view, which it does not keep: give their file")
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
     turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
     axis = None if "columns" in parameters or "axis_col" not in parameters else float(parameters["axis_col"])
     return PoseTable(path, "frame", frames, angles, shifts, turns, axis_col=axis)
 
+
+CENTRES_KEPT = "view_centres_mm"
+"""Parameter of a volume: `Geometry.centres` of its views."""
 
 POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 """Parameters of a volume that keep the poses of its views, shifts in binned pixels."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +21,35 @@ _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that te
 
 
 @dataclass(frozen=True, eq=False)
-class VolumeInFile:
-    """A volume whose voxels are in a file alone: its grid, and what reads it."""
+class VoxelsInFile:
+    """float32 voxels, [z, y, x] or [volume, z, y, x], that are in files alone: `read` gives a part where it is used."""
 
-    grid: Grid
-    read: Callable[[], Volume]
+    shape: tuple[int, ...]
+    read: Callable[[Any], NDArray[np.float32]]
+
+    @property
+    def dtype(self) -> np.dtype[np.float32]:
+        return np.dtype(np.float32)
+
+    def __getitem__(self, part: Any) -> NDArray[np.float32]:
+        return self.read(part)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype)
 
 
 class VolumeField:
-    """A field of a dataclass that holds a volume, or one in a file, which is read at the first use."""
+    """A field of a dataclass that holds a volume; voxels in a file alone are read at the first use."""
 
     def __get__(self, record: Any, owner: type | None = None) -> Volume:
         if record is None:
             raise AttributeError("a field without a default")
-        held = record.__dict__["volume"]
-        if isinstance(held, VolumeInFile):
-            held = record.__dict__["volume"] = held.read()
+        held: Volume = record.__dict__["volume"]
+        if isinstance(held.data, VoxelsInFile):
+            held = record.__dict__["volume"] = replace(held, data=held.data[:])
         return held
 
-    def __set__(self, record: Any, volume: Volume | VolumeInFile) -> None:
+    def __set__(self, record: Any, volume: Volume) -> None:
         record.__dict__["volume"] = volume
 
 
@@ -103,7 +113,7 @@ class ReconRecord:
     @property
     def grid(self) -> Grid:
         """Of the volume, which is not read for it."""
-        held: Volume | VolumeInFile = self.__dict__["volume"]
+        held: Volume = self.__dict__["volume"]
         return held.grid
 
     @property

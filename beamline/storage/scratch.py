@@ -34,7 +34,7 @@ def reserve(descriptor: int, wanted: int, folder: Path) -> None:
         DataError: the disk has not so much space.
     """
     there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
-    taken = 512 * there.st_blocks if hasattr(there, "st_blocks") else there.st_size
+    taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
     refusal = (
         f"{folder} has {size(free)} free, and {size(wanted - taken)} more are needed while the volume is made. Write "
         "the output to another disk. Nothing was written."

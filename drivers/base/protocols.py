@@ -203,6 +203,12 @@ class Camera(Protocol):
     def close(self) -> None: ...
 
 
+class CooledCamera(Camera, Protocol):
+    def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> float:
+        """Wait until the sensor is cold, at most `timeout` s; its temperature, °C. `progress` is told it and the status
+        of the cooler. Raises DeviceError: it does not get cold, or its cooler is off or in trouble."""
+
+
 class Shutter(Protocol):
     """Beam shutter. Darks need it closed. `by_hand`: the operator is asked to move it."""
 
@@ -214,6 +220,14 @@ class Shutter(Protocol):
     def close(self) -> None: ...
 
     def is_open(self) -> bool: ...
+
+
+@runtime_checkable
+class ConnectedShutter(Shutter, Protocol):
+    """A shutter with a connection of its own."""
+
+    def disconnect(self) -> None:
+        """End it; the shutter stays as it is."""
 
 
 class SampleMover(Protocol):
@@ -238,6 +252,13 @@ class Filter(Protocol):
         """Where it stands; None: the place has no name, or is not known. Raises DeviceError."""
 
 
+class ConnectedFilter(Filter, Protocol):
+    """A filter with a connection of its own."""
+
+    def close(self) -> None:
+        """End it; the filter stays where it is."""
+
+
 class Monochromator(Protocol):
     """Sets the photon energy of the beam, in keV."""
 
@@ -248,6 +269,18 @@ class Monochromator(Protocol):
 
     def energy(self) -> float | None:
         """Where it stands; None: not known. Raises DeviceError."""
+
+
+class ConnectedMonochromator(Monochromator, Protocol):
+    """A monochromator with a connection of its own."""
+
+    def energy(self) -> float: ...
+
+    def stop(self) -> None:
+        """Stop it where it can be stopped. Raises DeviceError."""
+
+    def close(self) -> None:
+        """End the connection; the monochromator stays where it is."""
 
 
 @runtime_checkable

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
@@ -12,12 +13,12 @@ from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, Tr
 from drivers.dcam import cooling
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import BufFrame, CaptureMode, CaptureState, Error, Property
-from drivers.dcam.options import DcamOptions, TriggerMode
 from drivers.dcam.properties import Properties
 from drivers.dcam.ring import START_TIMEOUT, Ring, require_stamps, seconds_of
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, description, read_settings, read_timing
 from drivers.frame_memory import FrameMemory
+from drivers.orca_quest import DcamOptions, TriggerMode
 
 _WAIT_SLICE = 0.1  # s; short, since an event between a check and the wait is missed
 _LEAST_SLOTS = 16  # if memory allows: the camera may take additional frames while the host is busy
@@ -115,7 +116,7 @@ class DcamCamera:
         if self._options.trigger_mode is TriggerMode.START:
             apply_trigger_source(self._properties, self._settings.trigger)
         # One slot more than frames: the oldest slot of a full ring may be half overwritten at any moment.
-        fitting = self._options.ring_bytes // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
+        fitting = self._options.ring // round(self._properties.get(Property.BUFFER_FRAMEBYTES))
         slots = max(2, min(max(n_frames + 1, _LEAST_SLOTS), fitting))
         ring = self._start(slots, CaptureMode.SEQUENCE)
         self._overwritten, self._transport_losses, self._clock_offset = 0, 0, None
@@ -287,3 +288,9 @@ class DcamCamera:
             self._clock_offset = self._clock.now() - delay - stamp
         external = self._settings.trigger is TriggerSource.EXTERNAL
         return self._clock_offset + stamp - (self._options.trigger_delay if external else 0.0)
+
+
+def configured(section: Any, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
+    """The camera of a section of a configuration, connected; see `DcamCamera` for errors and `memory`."""
+    library = None if section.library is None else Path(section.library)
+    return DcamCamera(library, section.index, clock=clock, options=section.options, memory=memory)

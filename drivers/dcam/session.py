@@ -6,9 +6,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from drivers import usb
 from drivers.base.errors import DeviceError
-from drivers.dcam import codes
+from drivers.dcam import codes, usb
 from drivers.dcam.abi import Dcam, DcamError
 from drivers.dcam.codes import DcamEvent, Error
 

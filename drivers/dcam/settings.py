@@ -12,9 +12,9 @@ from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 from drivers.dcam import codes
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import Cooler, Error, Property, Text
-from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from drivers.dcam.properties import Properties
 from drivers.dcam.session import Session
+from drivers.orca_quest import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 
 _NOT_AVAILABLE = (Error.NOTSUPPORT, Error.NOTIMPLEMENT, Error.UNKNOWNSTRID, Error.INVALIDPARAM)
 _OPTIONAL = MappingProxyType(

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid
+from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
+from drivers.flat import key
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
@@ -16,23 +17,18 @@ NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes 
 
 @dataclass(frozen=True)
 class ShutterPvs:
-    """The process variables of a shutter, as pva://NAME or ca://NAME.
+    """The process variables of a shutter, each as pva://NAME or ca://NAME; times in s."""
 
-    Attributes:
-        open_pv, open_value: what is written to open it; `close_pv` and `close_value` likewise.
-        status_pv: where the blade itself is read; it is open at `status_open`, a number, a text or a label.
-        timeout: s, for each answer.
-        travel: s that the status may take to follow.
-    """
-
-    open_pv: str
-    close_pv: str
-    status_pv: str
-    open_value: float | str = 1
-    close_value: float | str = 0
-    status_open: float | str = 1
-    timeout: float = 2.0
-    travel: float = 10.0
+    open_pv: str = key(problem=url_problem)
+    status_pv: str = key(
+        doc="Where the blade itself is read; open_pv where there is nothing better.", problem=url_problem
+    )
+    close_pv: str | None = key(None, "null: open_pv, which then takes both values.", problem=url_problem)
+    open_value: float | str = key(1.0, "Written to open_pv to open it: a number, a text or a label.")
+    close_value: float | str = key(0.0)
+    status_open: float | str = key(1.0, "Its value or label while the shutter is open; anything else is closed.")
+    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = key(10.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
 
 
 class PvShutter:
@@ -52,7 +48,8 @@ class PvShutter:
         self._check: Callable[[], None] = lambda: None
         with ExitStack() as opened:
             self._opener, self._closer, self._status = (
-                _channel(url, name, pvs.timeout, opened) for url in (pvs.open_pv, pvs.close_pv, pvs.status_pv)
+                _channel(url, name, pvs.timeout, opened)
+                for url in (pvs.open_pv, pvs.close_pv or pvs.open_pv, pvs.status_pv)
             )
             _ = self.is_open()
             self.disconnect: Callable[[], None] = opened.pop_all().close

@@ -1,6 +1,7 @@
 """The registry of stages: the driver of each kind.
 
-Adding a stage takes its folder `drivers/stages/<kind>` with a module `stage`, and its line in REGISTRY.
+Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
+folder says.
 """
 
 from __future__ import annotations
@@ -8,17 +9,14 @@ from __future__ import annotations
 from importlib import import_module
 
 from drivers.stages.settings import StageDriver, with_keys
-from recon.base.registry import Registry
+from recon.base.registry import Registry, in_folders
 
-REGISTRY = {  # kind, as a configuration names it: class in the kind's module `stage`
-    "pm16c": "PM16CStage",
-    "pi_gcs": "PiGcsStage",
-    "zaber": "ZaberStage",
-    "epics": "EpicsStage",
-}
 STAGES: Registry[StageDriver] = Registry(
     "stage",
-    {kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},
+    {
+        kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name)
+        for kind, name in in_folders("drivers.stages", "DRIVERS").items()
+    },
     with_keys,
 )
-"""Kind -> the driver."""
+"""Kind, as a configuration names it -> the driver."""

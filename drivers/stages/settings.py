@@ -7,45 +7,17 @@ writes it: its unit, which ends the key's name, its legal values and its meaning
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.flat import flat_fields
-from drivers.serial.line import LineRules, Probe, SerialLine
+from drivers.flat import Key, flat_fields
+from drivers.flat import key as key
 
 FARTHEST = 1e9  # rad
 MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
-ANGULAR = {"deg", "deg_s", "deg_s2"}  # Units of keys whose fields are in radians
-
-
-@dataclass(frozen=True)
-class Key:
-    """How a configuration writes a field.
-
-    Attributes:
-        unit: ending of the key's name; "" without one.
-        default: in that unit; MISSING if the key is required.
-        doc: its meaning, if the name does not tell.
-        bounds: legal values, by pydantic's names: gt, ge, le, pattern.
-    """
-
-    unit: str
-    default: Any
-    doc: str
-    bounds: Mapping[str, Any]
-
-    def name_of(self, field: str) -> str:
-        return f"{field}_{self.unit}" if self.unit else field
-
-
-def key(default: Any = MISSING, doc: str = "", *, unit: str = "", **bounds: Any) -> Any:
-    """A dataclass field that a configuration writes; `default` in the key's unit."""
-    inside = math.radians(default) if unit in ANGULAR and isinstance(default, float) else default
-    return field(default=inside, metadata={"key": Key(unit, default, doc, bounds)})
 
 
 def with_keys(name: str, driver: Any) -> Any:
@@ -142,11 +114,6 @@ class Wiring:
     def __post_init__(self) -> None:
         if not 0 < self.timeout < math.inf:
             raise ValueError(f"a timeout of {self.timeout:g} s is not possible; expected a positive number of seconds")
-
-    def line(self, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-        """The open line to the controller of the stage `name`; `rules` as in `LineRules`."""
-        given: dict[str, Any] = {"timeout": self.timeout, "baudrate": self.baudrate, "transcript": self.transcript}
-        return SerialLine(url, LineRules(probe, **rules), clock, device=name, **given)
 
 
 class StageSettings(Protocol):

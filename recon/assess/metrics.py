@@ -13,7 +13,7 @@ _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _BLURRED = 1.0  # voxels: of a reference, so that its noise does not decide which voxels are dense
 _SLAB = 32  # slices at a time
 _MOST = 2**21  # voxels at most that regions and their noise are computed from
-_PART = 2**22  # values whose errors are summed at a time
+SUMMED_VALUES = 2**22  # values whose errors are summed at a time
 _RIM = 2  # voxels at the edge of a region, where its surroundings blur into it
 
 Array = NDArray[np.floating]
@@ -40,7 +40,7 @@ def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
 
 
 def _squared_error(truth: Array, volume: Array) -> float:
-    step = max(1, _PART * len(truth) // truth.size)
+    step = max(1, SUMMED_VALUES * len(truth) // truth.size)
     parts = (slice(first, first + step) for first in range(0, len(truth), step))
     return sum(float(np.sum(np.subtract(volume[p], truth[p], dtype=np.float64) ** 2)) for p in parts)
 

@@ -14,7 +14,9 @@ Cone beam: the source lies at -sod * d, the detector sdd away from it. A point a
 axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
 
 A real set-up departs from this in three ways, each given for every view. `tilt` leans the rotation axis along the beam
-(laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector.
+(laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector. The sources of a
+cone may stand anywhere: then `centres` displace the view's axes, and x - centre takes the place of x.
+`recon.base.vectors` makes a geometry of vectors of each view.
 
 Two more follow from the exposure. `width` says what a pixel sees beside its central ray. `skew` says how far the stage
 turns from the readout of one row to the next (rolling shutter): row j sees the angle θ + j skew.
@@ -25,17 +27,19 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F64
+from recon.base.declared_types import check_arguments
 from recon.base.picture import fan, html
 from recon.base.ray_width import NO_WIDTH, RayWidth
+from recon.base.settings_check import check_settings
 
-_OF_VIEWS = "angles", "shifts", "roll", "tilt"  # attributes with one value for each view
+_OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
 
@@ -73,6 +77,8 @@ class Geometry:
         tilt: float64 [view], radians; the rotation axis leaning along the beam: rows then run along v cos + d sin.
         width: of every ray; see `seen_with`.
         skew: radians from one row to the next, of a parallel beam; `angles` are those of the first row.
+        centres: float64 [view, 3], (x, y, z) in mm, of a cone: the point that stands `sod` behind the source along the
+            view's beam. Left out: the origin.
     """
 
     angles: F64
@@ -87,8 +93,17 @@ class Geometry:
     tilt: F64
     width: RayWidth = NO_WIDTH
     skew: float = 0.0
+    centres: F64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
+        check_settings(self)
+        if not self.centres.any():
+            object.__setattr__(self, "centres", _frozen(np.zeros((self.angles.size, 3))))
+        elif not self.is_cone or self.width.arc:
+            raise ValueError(
+                "centres were given of a parallel beam, or of views that turn while they are exposed: expected a cone "
+                "without an arc. Displace the views of a parallel beam by shifts"
+            )
         if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
             raise ValueError(
                 f"a skew of {self.skew:.3g} rad a row: expected a finite one, of straight views of a parallel beam. "
@@ -112,6 +127,7 @@ class Geometry:
         Raises:
             ValueError: for no views, non-finite angles, an empty detector, or a pitch that is not positive.
         """
+        check_arguments(cls.parallel, locals())
         return _checked(angles, detector_shape, pixel_pitch, (math.inf, math.inf), **where)
 
     @classmethod
@@ -132,6 +148,7 @@ class Geometry:
         Raises:
             ValueError: as `parallel`, and for distances that are not finite with 0 < sod <= sdd.
         """
+        check_arguments(cls.cone, locals())
         if not (math.isfinite(sod) and math.isfinite(sdd) and 0 < sod <= sdd):
             raise ValueError(f"a cone beam needs finite distances with 0 < sod <= sdd in mm, got {sod} and {sdd}")
         return _checked(angles, detector_shape, pixel_pitch, (float(sod), float(sdd)), **where)
@@ -156,13 +173,16 @@ class Geometry:
         Raises:
             ValueError: as `cone`.
         """
+        check_arguments(cls.fan, locals())
+        if shifts is not None and np.shape(shifts) != np.shape(np.atleast_1d(angles)):
+            raise ValueError(f"shifts must be one number a view [{np.size(angles)}], got shape {np.shape(shifts)}")
         moved = None if shifts is None else np.stack([np.asarray(shifts, np.float64), np.zeros(np.size(angles))], 1)
         return cls.cone(angles, (1, cols), pixel_pitch, sod, sdd, axis_col=axis_col, axis_row=0.0, shifts=moved)
 
     def __repr__(self) -> str:
         low, high = np.rad2deg((self.angles.min(), self.angles.max()))
         beam = f"cone {self.sod:.6g}:{self.sdd:.6g}" if self.is_cone else "parallel"
-        moved = [name for name in ("shifts", "roll", "tilt") if getattr(self, name).any()]
+        moved = [name for name in ("shifts", "roll", "tilt", "centres") if getattr(self, name).any()]
         moved += [name for name in ("width", "skew") if getattr(self, name)]
         return (
             f"Geometry({beam}, {self.n_views} views from {low:.4g} to {high:.4g} degrees, detector "
@@ -185,8 +205,8 @@ class Geometry:
 
     @property
     def is_straight(self) -> bool:
-        """Rows run along u and columns along the rotation axis: no roll, no tilt (views may be shifted)."""
-        return not (self.roll.any() or self.tilt.any())
+        """Rows run along u and columns along the rotation axis: no roll, tilt or centres (views may be shifted)."""
+        return not (self.roll.any() or self.tilt.any() or self.centres.any())
 
     @property
     def rows_show_slices(self) -> bool:
@@ -199,7 +219,7 @@ class Geometry:
 
         By the middle half of them, which climbs half as far: single views that stand apart make no climb.
         """
-        low, high = np.percentile(self.shifts[:, 1], (25, 75))
+        low, high = np.percentile(self.offsets[:, 1], (25, 75))
         return bool(4 * (high - low) >= self.detector_shape[0])
 
     @property
@@ -223,7 +243,23 @@ class Geometry:
     def is_off_middle(self) -> bool:
         """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
         cols = self.detector_shape[1]
-        return abs(float((self.axis_col + self.shifts[:, 0]).mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
+        return abs(float((self.axis_col + self.offsets[:, 0]).mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
+
+    @property
+    def offsets(self) -> F64:
+        """Pixels (col, row) from (axis_col, axis_row) to the image of the object's origin, [view, 2]."""
+        if not self.centres.any():
+            return self.shifts
+        u, v, w = np.einsum("vij,vj->iv", [self.axes(view) for view in range(self.n_views)], -self.centres)
+        return np.asarray(self.shifts + np.stack((u, v), 1) * (self.sdd / (self.sod + w) / self.pixel_pitch)[:, None])
+
+    @property
+    def source_distance(self) -> float:
+        """mm from the object's origin to the nearest source; infinite for a parallel beam."""
+        if not self.centres.any():
+            return self.sod
+        beams = np.array([self.axes(view)[2] for view in range(self.n_views)])
+        return float(np.linalg.norm(self.centres - self.sod * beams, axis=1).min())
 
     @property
     def middle_height(self) -> float:
@@ -241,14 +277,14 @@ class Geometry:
 
         Rolled views count as straight ones. For a wide cone the value is limited to 0.7 sod.
         """
-        cols, axis = self.detector_shape[1], self.axis_col + self.shifts[:, 0]
+        cols, axis = self.detector_shape[1], self.axis_col + self.offsets[:, 0]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
-        return float(min(reach, _SHORT_OF_SOURCE * self.sod))
+        return float(min(reach, _SHORT_OF_SOURCE * self.source_distance))
 
     @property
     def heights(self) -> tuple[float, float]:
         """Lowest and highest z in mm, at the rotation axis, that any view sees; tilted views count as straight ones."""
-        rows, axis = self.detector_shape[0], self.axis_row + self.shifts[:, 1]
+        rows, axis = self.detector_shape[0], self.axis_row + self.offsets[:, 1]
         low, high = -0.5 - axis.max(), rows - 0.5 - axis.min()
         return float(low * self.sample_pitch), float(high * self.sample_pitch)
 
@@ -267,7 +303,7 @@ class Geometry:
         )
 
     def origin(self, view: int) -> tuple[float, float]:
-        """Pixel (col, row) of the origin of the object's frame in one view."""
+        """Pixel (col, row) of the origin of the object's frame, or of the view's centre, in one view."""
         return self.axis_col + float(self.shifts[view, 0]), self.axis_row + float(self.shifts[view, 1])
 
     def select(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Geometry:
@@ -286,9 +322,9 @@ class Geometry:
         """The same set-up at other angles (radians), with the shift, roll and tilt common to all views.
 
         Raises:
-            ValueError: for bad angles, or if shift, roll or tilt differ between views: new views have unknown ones.
+            ValueError: for bad angles, or if shift, roll, tilt or centre differ between views: new ones are not known.
         """
-        for name, own in (("shifts", self.shifts), ("roll", self.roll), ("tilt", self.tilt)):
+        for name, own in ((name, getattr(self, name)) for name in _OF_VIEWS if name != "angles"):
             widest = float(np.ptp(own, axis=0).max())
             if widest > 0:
                 raise ValueError(
@@ -296,11 +332,12 @@ class Geometry:
                     f"known. Give a geometry whose views share one value, or one that holds the other views"
                 )
         n = np.size(angles)
-        return _checked(
+        views = _checked(
             angles, self.detector_shape, self.pixel_pitch, (self.sod, self.sdd), axis_col=self.axis_col,
             axis_row=self.axis_row, shifts=np.broadcast_to(self.shifts[0], (n, 2)), roll=self.roll[0],
             tilt=self.tilt[0],
         ).seen_with(self.width, self.skew)  # fmt: skip
+        return views.about(np.broadcast_to(self.centres[0], (n, 3)))
 
     def followed_by(self, other: Geometry) -> Geometry:
         """The views of this geometry, then those of another one of the same set-up."""
@@ -310,8 +347,14 @@ class Geometry:
         return replace(self, **both)
 
     def straightened(self) -> Geometry:
-        """The same views without roll and tilt."""
-        return replace(self, roll=_frozen(np.zeros(self.n_views)), tilt=_frozen(np.zeros(self.n_views)))
+        """The same views without roll, tilt and centres."""
+        none = _frozen(np.zeros(self.n_views))
+        return replace(self, roll=none, tilt=none, centres=_frozen(np.zeros((self.n_views, 3))))
+
+    def scaled(self, factor: float) -> Geometry:
+        """The same with all lengths in another unit: `factor` times as many."""
+        lengths = {name: factor * getattr(self, name) for name in ("pixel_pitch", "sod", "sdd")}
+        return replace(self, **lengths, centres=_frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
         """The same views, whose rays have a width and whose rows were read one after the other.
@@ -321,6 +364,17 @@ class Geometry:
                 belong to no row.
         """
         return replace(self, width=width, skew=float(skew))
+
+    def about(self, centres: ArrayLike) -> Geometry:
+        """The same views of a cone about other points of the object, [view, 3] in mm; see `centres`.
+
+        Raises:
+            ValueError: not finite, another shape, or of a parallel beam.
+        """
+        points = np.asarray(centres, np.float64)
+        if points.shape != (self.n_views, 3) or not np.isfinite(points).all():
+            raise ValueError(f"centres must be finite mm (x, y, z) [{self.n_views}, 3], got shape {points.shape}")
+        return replace(self, centres=_frozen(points))
 
     def at_row(self, row: float) -> Geometry:
         """The same without skew: all rows at the angle of this one."""
@@ -389,6 +443,7 @@ def _checked(
     """The geometry with these `sod` and `sdd`. TypeError: a keyword that `Where` lacks."""
     if unknown := where.keys() - Where.__annotations__.keys():
         raise TypeError(f"a geometry has no {', '.join(sorted(unknown))}; expected {', '.join(Where.__annotations__)}")
+    check_arguments(Where, where)
     axis_col, axis_row, shifts = where.get("axis_col"), where.get("axis_row"), where.get("shifts")
     theta = np.atleast_1d(np.asarray(angles, dtype=np.float64))
     rows, cols = (operator.index(n) for n in detector_shape)

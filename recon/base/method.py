@@ -22,6 +22,7 @@ from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
+from recon.base.settings_check import check_settings
 from recon.base.stop import Stop
 from recon.base.volume import Grid, Volume, VolumeSeries
 
@@ -67,6 +68,9 @@ class Energies:
     of_view: NDArray[np.intp]
     cross_sections: F64
 
+    def __post_init__(self) -> None:
+        check_settings(self)
+
 
 @dataclass(frozen=True, eq=False)
 class DataUse:
@@ -89,6 +93,9 @@ class DataUse:
     emission: Any = None
     times: F64 | None = None
     energies: Energies | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +121,9 @@ class RunControl:
     now: Clock = time.perf_counter
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self)
 
     @property
     def stop(self) -> Stop:
@@ -162,9 +172,12 @@ class Reconstruction:
             must not import; None for other methods.
         checkpoint: the state of a fit, which `RunControl.resume` takes; see `checkpoint.arrays_of`.
         method: its name; of a choice (`recon.Auto`), that of the method chosen. `run` may leave it to the caller.
-        seconds: wall time of the reconstruction, which the caller of `run` measures.
+        seconds: wall time of the reconstruction. `run` may leave it to the caller, too, as 0.
         deviation: the standard deviation of each voxel, see `recon.error_bars`; None: not known.
         series: all volumes, the first of which is `volume`; None: the method makes one.
+        at: gives the volume [z, y, x] that a view shows, by its time as in `DataUse.times`, or by the number of its
+            energy; None: the method makes one volume.
+        chosen: how a choice, a budget or a preset came to the settings; empty where they were given.
     """
 
     volume: Volume
@@ -176,6 +189,8 @@ class Reconstruction:
     seconds: float = 0.0
     deviation: Volume | None = None
     series: VolumeSeries | None = None
+    at: Callable[[float], F32] | None = None
+    chosen: str = ""
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"

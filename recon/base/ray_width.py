@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
+
+from recon.base.settings_check import check_settings
 
 
 @dataclass(frozen=True)
@@ -21,10 +22,7 @@ class RayWidth:
     arc: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("pixel", "blur", "arc"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} of a ray's width must be finite and 0 or more, got {value}")
+        check_settings(self, least=dict.fromkeys(("pixel", "blur", "arc"), 0.0))
 
     def __bool__(self) -> bool:
         return self.variance > 0 or self.arc > 0

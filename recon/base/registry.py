@@ -1,7 +1,7 @@
 """Registry: what there is of a kind, by name: ours, and what other installed packages add by entry points.
 
-Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check or
-effect; the entry point's name is the name of the addition.
+Their group is `splatline.KIND`, where KIND is method, correction, reader, volume_format, stage, wire, camera, check,
+effect or command; the entry point's name is the name of the addition.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import redirect_stdout
 from functools import cache, cached_property
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pkgutil import iter_modules
 from typing import Any, Generic, TypeVar
 
 _PREFIX = "splatline."
@@ -25,12 +27,15 @@ def unknown(kind: str, name: object, legal: Iterable[str]) -> str:
     """The message for an unknown name, with the legal names and the nearest one; without a full stop.
 
     Args:
-        kind: what the name is of, such as "method".
+        kind: what the name is of, such as "method"; empty where the sentence goes on from that.
     """
     names = list(legal)
-    near = nearest(name, names)
-    meant = f" (did you mean {near}?)" if near else ""
-    return f"{kind} {name!r} is unknown; legal: {', '.join(names) or 'none'}{meant}"
+    return f"{kind} {name!r} is unknown; legal: {', '.join(names) or 'none'}{did_you_mean(name, names)}".lstrip()
+
+
+def did_you_mean(name: object, legal: Iterable[str]) -> str:
+    """The nearest legal name as the end of a sentence, after a space; "" if none is near."""
+    return f" (did you mean {near}?)" if (near := nearest(name, legal)) else ""
 
 
 def nearest(name: object, legal: Iterable[str]) -> str:
@@ -88,6 +93,13 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._entries)
 
 
+def in_folders(package: str, table: str) -> dict[str, Any]:
+    """The dictionaries named `table` of the folders of a package, joined in the order of the folders' names."""
+    folders = sorted(name for _, name, is_folder in iter_modules(import_module(package).__path__) if is_folder)
+    modules = (import_module(f"{package}.{folder}") for folder in folders)
+    return {name: entry for module in modules for name, entry in getattr(module, table, {}).items()}
+
+
 def plugins(
     kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
 ) -> dict[str, Any]:
@@ -101,7 +113,7 @@ def plugins(
     Warns:
         UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
     """
-    announced = sorted(point for point in _announced() if point.group == _PREFIX + kind)
+    announced = sorted(point for point in entry_points_announced() if point.group == _PREFIX + kind)
     times, found = Counter(point.name for point in announced), dict[str, Any]()
     for point in announced:
         try:
@@ -137,7 +149,7 @@ def _one_line(text: str) -> str:
 
 
 @cache
-def _announced() -> tuple[EntryPoint, ...]:
+def entry_points_announced() -> tuple[EntryPoint, ...]:
     """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
     found = entry_points()
     return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import median_deviation
 
+HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
 _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
 _FEWEST = 5  # with fewer views there is no warning
 _OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels

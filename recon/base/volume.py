@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.declared_types import check_arguments, refusal
 from recon.base.empirical import COARSEST, WIDER
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
+from recon.base.settings_check import check_settings
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Grid:
     slice_pitch: float | None = None
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if len(self.shape) != 3 or min(self.shape) < 1:
             raise ValueError(f"grid shape must be (nz, ny, nx) >= 1, got {self.shape}")
         for name, edge in (("voxel_size", self.voxel_size), ("slice_pitch", self.spacing[0])):
@@ -55,6 +58,7 @@ class Grid:
         If the axis stands off the detector's middle (`Geometry.is_off_middle`), the box holds the field of a full turn
         of such views, as in `of_field`. Matter that views see but that has no voxel would be put into others.
         """
+        check_arguments(cls.matching, locals())
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
         if geometry.is_off_middle:
             across = max(across, cls.of_field(geometry, geometry.sample_pitch).shape[1])
@@ -72,7 +76,7 @@ class Grid:
         low, high = geometry.heights
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
         nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error adds no voxel
-        if geometry.is_cone and nx * voxel_size >= math.sqrt(2) * geometry.sod:
+        if geometry.is_cone and nx * voxel_size >= math.sqrt(2) * geometry.source_distance:
             nx = max(1, math.floor(across))  # the corners of the last voxel would reach the source
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
@@ -94,7 +98,7 @@ class Grid:
     def widened(self, by: float, geometry: Geometry) -> Grid:
         """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
         nz, nx, _ = self.shape
-        across = max(nx, math.floor(min(by * nx, math.sqrt(2) * geometry.sod / self.voxel_size - 1)))
+        across = max(nx, math.floor(min(by * nx, math.sqrt(2) * geometry.source_distance / self.voxel_size - 1)))
         return replace(self, shape=(nz, across, across))
 
     @property
@@ -140,7 +144,7 @@ def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
     by half the detector's rows or more, all that are seen are kept.
     """
     size = geometry.detector_shape[1 - axis]
-    first = -geometry.shifts[:, axis]
+    first = -geometry.offsets[:, axis]
     edges = np.unique(np.concatenate((first, first + size)))
     within = (edges[:-1] + edges[1:]) / 2
     covered = (first[:, None] <= within) & (within < first[:, None] + size)
@@ -159,8 +163,11 @@ class Volume:
     grid: Grid
 
     def __post_init__(self) -> None:
-        if self.data.shape != self.grid.shape:
-            raise ValueError(f"volume data has shape {self.data.shape}, its grid {self.grid.shape}")
+        if not isinstance(self.grid, Grid):
+            raise ValueError(refusal("grid", self.grid, Grid))
+        shape = getattr(self.data, "shape", None)  # of an array, or of a dataset that is sliced along z
+        if shape != self.grid.shape:
+            raise ValueError(f"data must be an array of its grid's shape {self.grid.shape} [z, y, x], got {shape}")
 
     def __repr__(self) -> str:
         size, edge = " x ".join(map(str, self.grid.shape)), self.grid.voxel_size
@@ -176,6 +183,7 @@ class Volume:
             ValueError: another suffix.
             FileExistsError: nothing is overwritten.
         """
+        check_arguments(self.save, {"path": path})
         path, grid = Path(path), self.grid
         if path.suffix != ".npz":
             raise ValueError(f"{str(path)!r} is no .npz; save writes only that. beamline export writes other formats")

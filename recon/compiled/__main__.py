@@ -64,7 +64,7 @@ def compile_for(checkouts: Sequence[str]) -> None:
                 try:
                     kernel.compile(types)
                     compiled += 1
-                except numba.core.errors.NumbaError as error:
+                except (numba.core.errors.NumbaError, TypeError) as error:  # TypeError: other numbers of arguments
                     sys.stdout.write(f"{module}.{kernel.py_func.__qualname__}{types}: {type(error).__name__}\n")
     sys.stdout.write(f"{compiled} signatures\n")
 

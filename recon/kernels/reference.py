@@ -81,6 +81,7 @@ def project_view(
         parameters: means [n, 3] mm (x, y, z), standard deviations [n, 3] mm, quaternions [n, 4], densities [n] 1/mm.
     """
     means, scales, quaternions, densities = parameters
+    means = means - means.new_tensor(geometry.centres[view])
     in_view = means @ means.new_tensor(geometry.axes(view)).T  # along columns, rows and beam
     seen = in_front(means, geometry, view)
     rays = torch.zeros_like(seen) if exact is None or not geometry.is_cone else exact & seen
@@ -101,7 +102,7 @@ def affine_error(
 ) -> Tensor:
     """ε [n], the estimate of `cpu.footprints` for the relative L2 error of a cone's affine footprints; no gradient."""
     means, scales, quaternions = means.detach(), scales.detach(), quaternions.detach()
-    axes = means.new_tensor(geometry.axes(view))
+    axes, means = means.new_tensor(geometry.axes(view)), means - means.new_tensor(geometry.centres[view])
     in_view, focal = means @ axes.T, geometry.sdd / geometry.pixel_pitch
     centre, jacobian = to_detector(in_view, geometry)
     turn = jacobian @ axes

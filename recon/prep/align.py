@@ -11,10 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.prep.axis_search import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
 from recon.prep.axis_search import AxisError as AxisError
@@ -219,7 +220,7 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     return candidates, np.stack([_mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
 
 
-def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
+def find_axis(projections: ArrayLike, angles: ArrayLike, search: Search = None) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
     If all views together give no axis, and they cover the full turn, pairs of opposite views do. The axis of a wide
@@ -240,7 +241,8 @@ def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search 
     Warns:
         UserWarning: where angles look like degrees, or projections like counts or transmission.
     """
-    theta = np.asarray(angles, np.float64)
+    check_arguments(find_axis, locals())
+    theta, projections = np.asarray(angles, np.float64), np.asarray(projections)
     if projections.ndim != 3:
         raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
     warn_of_degrees(theta)
@@ -256,7 +258,7 @@ def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search 
             return from_opposites
         if _has_opposites(theta, projections.shape[2]):
             return from_all  # one pair tells less than all of them, which do not agree
-    pair = _closest_pair(theta, tolerance=2 / projections.shape[2])
+    pair = closest_pair(theta, tolerance=2 / projections.shape[2])
     if pair is None:
         return from_all
     try:
@@ -282,7 +284,7 @@ def _confident_opposites(projections: NDArray[np.floating], theta: Floats, searc
     return None
 
 
-def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
+def closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
     """The two views nearest to half a turn apart; None if no pair is within the tolerance (radians)."""
     order = np.argsort(np.mod(theta, 2 * np.pi))
     turned = np.mod(theta[order], 2 * np.pi)

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import Mask
+from recon.base.declared_types import check_arguments
 from recon.base.masks import Image, fill, plan_fill
+from recon.base.settings_check import check_settings
 from recon.prep.air import air_columns, air_light, edge_depth, edge_profiles
 from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
@@ -44,6 +46,7 @@ class CorrectionSettings:
     sample_from: float = np.inf
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if not 0 < self.floor < 1:
             raise ValueError(f"floor is a transmission between 0 and 1, got {self.floor}")
         if not (self.hot_threshold > 0 and self.zinger_threshold > 0):
@@ -333,10 +336,10 @@ class Correction:
 
 def correct(
     counts: NDArray[np.generic],
-    positions: NDArray[np.float64],
+    positions: ArrayLike,
     references: References,
     settings: CorrectionSettings | None = None,
-    view_ids: NDArray[np.int64] | None = None,
+    view_ids: ArrayLike | None = None,
     masked: Mask | None = None,
 ) -> Projections:
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, by a `Correction` fed at once.
@@ -344,8 +347,10 @@ def correct(
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
     Memory beyond the result: a few frames. Arguments and errors are those of `Correction` and of its `transmission`.
     """
+    check_arguments(correct, locals())
     correction = Correction(references, settings, masked)
-    views = correction.transmission(counts, positions, view_ids)
+    ids = None if view_ids is None else np.asarray(view_ids, np.int64)
+    views = correction.transmission(counts, np.asarray(positions, np.float64), ids)
     correction.survey(views)
     return correction.line_integrals(views)
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from recon.base.arrays import F32, F64
+from recon.base.settings_check import check_settings
 
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
 # of the expansion on three samples at 10 to 10 000 photons (docs/notes/exploration.md). So are the other two.
@@ -62,6 +63,7 @@ class Counts:
     variance: ArrayLike = 0.0
 
     def __post_init__(self) -> None:
+        check_settings(self)
         shape = np.shape(self.counts)
         if len(shape) != 3 or 0 in shape:
             raise ValueError(f"counts must be [view, row, col] with at least one pixel, got shape {shape}")

@@ -19,7 +19,7 @@ import xraylib
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F64
-from recon.prep.phase import HC
+from recon.base.units import HC
 
 _LEAST_KEV, _MOST_KEV = 0.1, 800.0
 _DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
@@ -49,7 +49,7 @@ KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
         "separator": (1.064, {"C3H6": 590 * 0.90, **{salt: 0.41 * mass for salt, mass in _LP30.items()}}),
     }
 )
-"""Density in g/cm³ and parts of the mass; see simulators.light.palette for the sources."""
+"""Density in g/cm³ and parts of the mass; see simulators.samples.materials.palette for the sources."""
 
 
 _SHELLS = {"K": xraylib.K_SHELL, "L1": xraylib.L1_SHELL, "L2": xraylib.L2_SHELL, "L3": xraylib.L3_SHELL}

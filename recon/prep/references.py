@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon.base.masks import Image
+from recon.base.settings_check import check_settings
 from recon.prep.dynamic_flats import DynamicFlats
 
 
@@ -32,6 +33,7 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
+        check_settings(self)
         object.__setattr__(self, "dark", _mean(self.dark, "darks"))
         flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)

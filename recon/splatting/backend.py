@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any, Protocol, SupportsFloat, TypeVar
 
 import numpy as np
@@ -128,7 +129,7 @@ def backend_for(device: str) -> Backend[Any]:
             f"device {device!r} was asked for; a fit computes on 'cpu' or on 'cuda', the current CUDA device. Name "
             f"one of these. CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
         )
-    from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
+    Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
 
     return Gpu(device)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,12 @@ class DensityPolicy:
     rule: Rule = "mass"
 
     def __post_init__(self) -> None:
-        check_settings(self, choices={"rule": get_args(Rule)})
+        check_settings(
+            self,
+            whole={"every": 1},
+            least=dict.fromkeys(("start", "stop", "threshold", "large", "prune_below"), 0.0),
+            above={"growth": 0.0},
+        )
 
 
 @dataclass(frozen=True, eq=False)

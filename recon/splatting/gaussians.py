@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+from recon.base.settings_check import check_settings
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,6 +43,7 @@ class Gaussians:
     kernel: Kernel = Kernel.GAUSSIAN
 
     def __post_init__(self) -> None:
+        check_settings(self)
         n = self.means.shape[0]
         for name, width in _PARAMETERS.items():
             expected = (n, *width)
@@ -52,10 +55,10 @@ class Gaussians:
     @classmethod
     def from_physical(
         cls,
-        means: NDArray[np.floating],
-        scales: NDArray[np.floating],
-        densities: NDArray[np.floating],
-        quaternions: NDArray[np.floating] | None = None,
+        means: ArrayLike,
+        scales: ArrayLike,
+        densities: ArrayLike,
+        quaternions: ArrayLike | None = None,
         density_unit: float | None = None,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> Gaussians:
@@ -64,8 +67,11 @@ class Gaussians:
         Raises:
             ValueError: where a scale or a density is not positive and finite.
         """
+        check_arguments(cls.from_physical, locals())
         means = np.atleast_2d(np.asarray(means, np.float64))
         n = means.shape[0]
+        if means.shape != (n, 3):
+            raise ValueError(f"means must be positions [n, 3] in mm, got shape {means.shape}")
         scales = np.asarray(scales, np.float64)
         scales = np.broadcast_to(scales[:, None] if scales.ndim == 1 else scales, (n, 3))
         densities = np.broadcast_to(np.asarray(densities, np.float64), (n,))
@@ -75,10 +81,9 @@ class Gaussians:
                     f"{name} must be positive and finite, got values from {values.min()} to {values.max()}"
                 )
         unit = float(densities.max()) if density_unit is None else density_unit
-        if quaternions is None:
-            quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)) if quaternions is None else np.asarray(quaternions, np.float64)
         raw = inverse_softplus(densities / unit)
-        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(quaternions), _tensor(raw), unit, kernel)
+        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(turns), _tensor(raw), unit, kernel)
 
     @property
     def n(self) -> int:

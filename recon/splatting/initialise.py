@@ -149,7 +149,7 @@ def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bo
     Only edges far from the rotation axis count: with the axis far off the detector's middle, opposite views see the
     region beyond the nearer edge.
     """
-    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
+    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.offsets[:, 0]
     away = np.stack((axis + 0.5, cols - 0.5 - axis), 1)
     width = max(2, cols // 50)
     edges = np.stack((projections[..., :width].mean(axis=(1, 2)), projections[..., -width:].mean(axis=(1, 2))), 1)

@@ -22,7 +22,7 @@ from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
 from recon.splatting.splat import voxelize
 
-_NORMALISE = 100  # steps between two normalisations of the quaternions
+NORMALISE = 100  # steps between two normalisations of the quaternions
 
 
 @dataclass(eq=False)
@@ -131,7 +131,7 @@ def step(
 
     state.step += 1
     _update(state, run.gradients(), problem, settings, fraction)
-    if state.step % _NORMALISE == 0:
+    if state.step % NORMALISE == 0:
         _normalise_quaternions(state, backend)
     policy = settings.policy
     if policy is not None and state.step % policy.every == 0 and policy.start <= fraction < policy.stop:

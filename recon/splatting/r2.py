@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self, get_args
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -78,8 +78,7 @@ class R2:
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:
-        choices = {"start": get_args(Start)}
-        check_settings(self, whole={"steps": 0, "finish": 0}, least={"seconds": 0.0}, choices=choices)
+        check_settings(self, whole={"steps": 0, "gaussians": 1, "finish": 0}, least={"seconds": 0.0})
 
     @property
     def planned_steps(self) -> int | None:

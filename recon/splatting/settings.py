@@ -81,13 +81,13 @@ class FitSettings:
     kernel: Kernel = KERNEL
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kernel", Kernel(self.kernel))
         check_settings(
             self,
             whole=dict.fromkeys(("views_per_step", "joined_pixels", "tv_size", "paced_for"), 1),
             least=dict.fromkeys(("ssim_weight", "tv_weight", "tv_least"), 0.0),
             above=dict.fromkeys(("pace", "decay", "smallest"), 0.0),
         )
+        object.__setattr__(self, "kernel", Kernel(self.kernel))
         if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
             raise ValueError(
                 f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"

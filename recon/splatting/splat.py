@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
@@ -40,6 +42,7 @@ def project(
         ValueError: the implementation does not support tensors of this type or on this device.
         ImportError: the tensors are on a CUDA device and triton is not installed.
     """
+    check_arguments(project, locals())
     import torch
 
     from recon.kernels import reference
@@ -67,6 +70,7 @@ def voxelize(
     gaussians: Gaussians, grid: Grid, *, truncation: Truncation | None = None, implementation: Implementation = "auto"
 ) -> Tensor:
     """Density [z, y, x] (1/mm) of the Gaussians at the centres of any grid's voxels. Raises as `project`."""
+    check_arguments(voxelize, locals())
     import torch
 
     from recon.kernels import reference
@@ -85,7 +89,7 @@ def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
     from recon.splatting.autograd import On
 
     if implementation == "gpu":
-        from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
+        Gpu: Any = import_module("recon.kernels.gpu.engine").Gpu  # loads triton, so only if a GPU is used
 
         backend: Backend[Any] = Gpu(g.means.device)
     else:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
@@ -43,7 +44,7 @@ _LAST_GROWTH = 0.5  # density control ends at this share of the last round
 _AXIS_ANEW = 0.3  # px; a move of the axis by so much starts the rates anew, a smaller one in part
 _NEW = 0.2  # weight of the newest view in the running mean over views before they were learnt
 _BLIND = 100.0  # data so many times larger than the density unit implies show that the first views were empty
-_PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
+PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
 
 
@@ -74,6 +75,7 @@ class StreamingFit:
         first_span: float = np.pi / 6,
         now: Clock = time.perf_counter,
     ) -> None:
+        check_arguments(StreamingFit.__init__, locals())
         self._template, self._grid = template.at([0.0]), grid or Grid.matching(template)
         self._rng = np.random.default_rng(seed)
         if gaussians is not None and gaussians < 1:
@@ -116,6 +118,7 @@ class StreamingFit:
             ValueError: where shapes disagree with the template, values are not finite, or a view holds nothing but
                 values far too large; nothing is added.
         """
+        check_arguments(StreamingFit.add_views, locals())
         theta = np.atleast_1d(np.asarray(angles, np.float64))
         images = arrivals.checked(data, theta, self._template.detector_shape)
         if self._problem is None:
@@ -305,7 +308,7 @@ class StreamingFit:
         data = np.stack(self._data)
         wider = leaves_the_field(data, geometry)
         field = Grid.for_fit(self._template, self._grid, wider=wider)
-        coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / _PLACED_FROM) / 3))
+        coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
         rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel

@@ -469,8 +469,6 @@ def used_and_kept_back(
     Raises:
         ValueError: numbers that name no view, or all of them; none where `early_stop` needs some.
     """
-    if any(isinstance(view, bool | np.bool_) for view in held_out):
-        raise ValueError("held_out must be the numbers of views, got a mask of booleans: use numpy.flatnonzero of it")
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
     if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
         raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Self, get_args
+from typing import ClassVar, Self
 
 import numpy as np
 from numba import njit, prange
@@ -86,6 +86,11 @@ def posed_direct(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
     refuse_climbing(geometry)
+    if geometry.centres.any():
+        raise ValueError(
+            "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
+            "iterative method or r2"
+        )
     reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
     if reach >= geometry.sod:
         raise ValueError(
@@ -147,7 +152,7 @@ class Fbp:
     filter: Filter = "hann"
 
     def __post_init__(self) -> None:
-        check_settings(self, choices={"filter": get_args(Filter)})
+        check_settings(self)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]
@@ -209,10 +214,12 @@ def direct_work(geometry: Geometry, grid: Grid) -> Work:
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: a cone needs a full circle, or a short scan (`missing_arc`).
+    """Whether FBP or FDK takes these views: a cone needs a circle of sources, or a short scan (`missing_arc`).
 
     Views that climb along the axis have weights of their own in each slice, which only straight parallel ones have.
     """
+    if geometry.centres.any():
+        return False
     if geometry.climbs:
         return geometry.is_straight and not geometry.is_cone
     return not geometry.is_cone or missing_arc(geometry) == 0

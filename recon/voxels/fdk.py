@@ -21,7 +21,7 @@ F64 = NDArray[np.float64]
 
 _f = np.float32
 _SAMPLES = 4  # samples of a projector that take as long as a voxel in a view
-_SLAB_BYTES = 128 * 2**20  # filtered views held at a time
+SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 
 
 @njit(**OPTIONS)
@@ -100,7 +100,7 @@ def fdk(
     z, y, x = grid.coordinates()
     rows, cols = geometry.detector_shape
     volume = np.zeros((y.size, x.size, z.size), np.float32)
-    slab = max(1, _SLAB_BYTES // (4 * rows * cols))
+    slab = max(1, SLAB_BYTES // (4 * rows * cols))
     for start in range(0, geometry.n_views, slab):
         part = geometry.select(slice(start, start + slab))
         rays = weights[start : start + slab]

@@ -116,17 +116,21 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
 def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
     """So many rows in the middle of a cone, as a geometry, and the box that holds their rays.
 
-    None: views are displaced along the rows, or these rows show little of the matter in `data` [view, row, col].
+    None: views of a circle are displaced along the rows, or these rows show little of the matter in `data` [view, row,
+    col].
     """
-    first = round(geometry.axis_row - (height - 1) / 2)
+    off, around = geometry.offsets[:, 1], not geometry.centres.any()
+    first = round(geometry.axis_row + (0.0 if around else float(np.median(off))) - (height - 1) / 2)
     rows = slice(first, first + height)
-    if np.abs(geometry.shifts[:, 1]).max() > 1 or first < 0 or rows.stop > geometry.detector_shape[0]:
+    if (around and np.abs(off).max() > 1) or first < 0 or rows.stop > geometry.detector_shape[0]:
         return None
     some = data[:: max(1, len(data) // 8)]
     if np.abs(some[:, rows]).sum() < ENOUGH_MATTER * np.abs(some[:, busiest_rows(some, height)]).sum():
         return None
     # At the far side of the field.
-    tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
+    climb = 0.0 if around else float(np.ptp(off))
+    tall = (height + 1 + climb) * geometry.sample_pitch + 2 * geometry.lean
+    tall *= 1 + geometry.reach / geometry.source_distance
     slices = math.ceil(tall / grid.spacing[0])
     box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
     return rows, geometry.rows(rows.start, rows.stop), box

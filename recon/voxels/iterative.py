@@ -10,9 +10,8 @@ in other units sums of their squares could exceed the range of float32.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -27,12 +26,14 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 from recon.voxels.voxel_problem import VoxelProblem
 
 UNITS = "units"  # name of the decision on them
+TV_WEIGHT_CHOSEN = "tv_weight_chosen"
+"""Name of the weight of total variation that a method chose, as its setting `tv_weight` would state it at the end."""
 _SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait for each other more than they work
 
 
 @runtime_checkable
 class IterativeMethod(Protocol):
-    """An iterative method on voxels, such as `recon.voxels.methods.sirt.Sirt`."""
+    """An iterative method on voxels, such as `recon.features.iterative.sirt.Sirt`."""
 
     @property
     def iterations(self) -> int: ...
@@ -102,10 +103,8 @@ def solve(
 
     Raises:
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
-            that are zero everywhere, or no iterations.
+            that are zero everywhere.
     """
-    if operator.index(method.iterations) < 1:
-        raise ValueError(f"at least one iteration is needed, got {method.iterations}")
     data, rays = _checked(projector, projections, weight)
     lines = _start(projector, start)
     decide = decide or Decisions()
@@ -157,7 +156,8 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
         watch=Watch(report, control.stop_of_trials), decide=decide,
     )  # fmt: skip
-    return Reconstruction(volume, {**settings, "seed": problem.seed}, tuple(history))
+    chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
+    return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
 
 
 def prior_decisions(made: Mapping[str, Sequence[Any]]) -> dict[str, Sequence[Any]]:
@@ -195,12 +195,9 @@ class _Units(NamedTuple):
         if rays is not None:
             _times_power(rays, -self.weight)
         views, box = projector.geometry, projector.grid
-        pitch, sod, sdd = (math.ldexp(n, -self.length) for n in (views.pixel_pitch, views.sod, views.sdd))
         edge, slices = (math.ldexp(n, -self.length) for n in (box.voxel_size, box.spacing[0]))
         z, y, x = (math.ldexp(n, -self.length) for n in box.centre)
-        return Projector(
-            replace(views, pixel_pitch=pitch, sod=sod, sdd=sdd), Grid(box.shape, edge, (z, y, x), slices)
-        )  # fmt: skip
+        return Projector(views.scaled(math.ldexp(1.0, -self.length)), Grid(box.shape, edge, (z, y, x), slices))
 
 
 def _times_power(array: F32, power: int) -> F32:

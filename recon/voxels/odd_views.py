@@ -26,6 +26,7 @@ _BAND, _TOGETHER = 16, 32  # rows that are projected together; views that are co
 _AT_A_TIME = 8  # views of a cone that are projected together
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that define the usual difference; nearest ones left out
+_LEAST_NOISE = 2e-3  # of a pixel, of a view's largest line integral: neither a frame nor the end of a fit has less
 _OUTLIER = 3.0  # times their median: largest contribution of one view
 _SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
 _EXTENT = 0.5  # share of the limit above which a cell belongs to the region
@@ -202,7 +203,7 @@ def _differences(
         progress(compared * geometry.n_views // all_rows, geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
         third = np.diff(seen[view], 3, axis=1)  # noise of the view; the finest detail of the sample counts as noise
-        noise = median_deviation(third) / math.sqrt(20.0)
+        noise = max(median_deviation(third) / math.sqrt(20.0), _LEAST_NOISE / side * float(np.abs(seen[view]).max()))
         if not lit[view].any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue

@@ -38,10 +38,10 @@ class Subsets:
     step: float
 
     @classmethod
-    def of(cls, problem: VoxelProblem, most: int) -> Subsets:
-        """At most so many; each has at least twelve views."""
+    def of(cls, problem: VoxelProblem, most: int, fewest: int = 1) -> Subsets:
+        """At most so many; see `subsets_of`."""
         projector, weight = problem.projector, problem.weight
-        count = subsets_of(projector.geometry, most)
+        count = subsets_of(projector.geometry, most, fewest)
         if count == 1:
             return cls(interleaved(projector, 1), [projector], 1 / largest_eigenvalue(projector, weight))
         views = interleaved(projector, count)
@@ -97,6 +97,7 @@ def ordered_fista(
     return x
 
 
-def subsets_of(geometry: Geometry, most: int) -> int:
-    """Number of subsets that `Subsets.of` makes of these views."""
-    return max(1, min(most, geometry.n_views // LEAST_OF_SUBSET))
+def subsets_of(geometry: Geometry, most: int, fewest: int = 1) -> int:
+    """Number of subsets: of `LEAST_OF_SUBSET` views or more; from that many views on at least `fewest`."""
+    whole = geometry.n_views // LEAST_OF_SUBSET
+    return max(1, min(most, max(whole, fewest) if whole else 1))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.base.settings_check import check_settings
 from recon.base.slabs import bands_of
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
@@ -64,11 +65,12 @@ class Projector:
     _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        check_settings(self)
         reach = float(np.hypot(*np.abs(self.grid.edges[:, :2]).max(0)))
-        if self.geometry.is_cone and reach >= self.geometry.sod:
+        if self.geometry.is_cone and reach >= self.geometry.source_distance:
             raise ValueError(
                 f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
-                f"{self.geometry.sod:.4g} mm: give a smaller grid"
+                f"{self.geometry.source_distance:.4g} mm: give a smaller grid"
             )
         found = [
             (band, [self._rays(at) for at in views_of_exposure(views)])
@@ -309,6 +311,6 @@ def _plain(array: F32) -> F32:
 
 
 def _fitting(array: F32, shape: tuple[int, ...], name: str) -> F32:
-    if array.shape != shape:
-        raise ValueError(f"the {name} has shape {array.shape}, the projector expects {shape}")
+    if np.shape(array) != shape:
+        raise ValueError(f"the {name} has shape {np.shape(array)}, the projector expects {shape}")
     return array

@@ -60,9 +60,9 @@ def power_rounds(geometry: Geometry, grid: Grid, subsets: int = 1) -> Work:
     return sweep(geometry, some) * (POWER_ROUNDS / subsets)
 
 
-def fista_sweeps(geometry: Geometry, grid: Grid, sweeps: float, subsets: int, tv_steps: int) -> Work:
-    """Sweeps of `ordered_fista`."""
-    count = subsets_of(geometry, subsets)
+def fista_sweeps(geometry: Geometry, grid: Grid, sweeps: float, subsets: int, tv_steps: int, fewest: int = 1) -> Work:
+    """Sweeps of `ordered_fista`; subsets as of `subsets_of`."""
+    count = subsets_of(geometry, subsets, fewest)
     step = on_volume("pass", grid, 1 + _PASSES_AHEAD) + on_volume("tv", grid, tv_steps + 1)
     return sweeps * (sweep(geometry, grid) + count * step)
 

@@ -68,6 +68,24 @@ class Changing:
         return self.start.labels(grid)
 
 
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A volume as stored in a file.
+
+    Attributes:
+        values: [z, y, x] or in another order that the scene gives, real numbers in the file's own units.
+        spacing: mm from voxel to voxel along the same axes; None: the file does not state it.
+    """
+
+    values: NDArray[np.generic]
+    spacing: tuple[float, float, float] | None = None
+
+
+ReadVolume = Callable[[str, str | None], Stored]
+"""Reads the file that a scene names, and a dataset in it. The caller of `load_scene` provides it, since simulators open
+no files; its errors pass through."""
+
+
 def sample_at(sample: Sample, seconds: float) -> Sample:
     """The sample so many seconds after the camera was connected."""
     return sample.at(seconds) if isinstance(sample, Changing) else sample

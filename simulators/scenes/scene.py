@@ -31,7 +31,7 @@ from simulators.samples.composed.phantoms import build_sample
 from simulators.samples.sample import Sample
 
 if TYPE_CHECKING:
-    from simulators.samples.voxels.volume import ReadVolume
+    from simulators.samples.sample import ReadVolume
 
 
 Frames = Annotated[int, Field(ge=0, le=1_000_000)]  # as in a configuration

@@ -1,19 +1,16 @@
-"""The registry of simulated controllers: the other end of each stage's wire, by the stage's kind."""
+"""The registry of simulated controllers: the other end of each stage's wire, by the stage's kind.
+
+Adding one takes its folder `simulators/wires/<kind>`: a module `wire` with the class, whose name CONTROLLERS of the
+folder says.
+"""
 
 from __future__ import annotations
 
 from importlib import import_module
 
 from drivers.flat import flat_fields
-from recon.base.registry import Registry
+from recon.base.registry import Registry, in_folders
 from simulators.wires.wire import Build
-
-REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's module `wire`
-    "pm16c": "PM16CBuild",
-    "pi_gcs": "PiGcsBuild",
-    "zaber": "ZaberBuild",
-    "epics": "EpicsBuild",
-}
 
 
 def _fitting(name: str, found: type[Build]) -> type[Build]:
@@ -24,7 +21,10 @@ def _fitting(name: str, found: type[Build]) -> type[Build]:
 
 WIRES: Registry[type[Build]] = Registry(
     "wire",
-    {kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
+    {
+        kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name)
+        for kind, name in in_folders("simulators.wires", "CONTROLLERS").items()
+    },
     _fitting,
 )
 """Kind -> how its simulated controller is built."""

@@ -25,7 +25,7 @@ class ArraySource:
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
     row_pitch_mm: float | None = None
-    in_order, numbers = True, None
+    in_order, numbers, frames_per_view = True, None, 1
     not_used: tuple[Any, ...] = ()
     attributes: dict[str, Any] = {}  # noqa: RUF012
     row_period: float | None = None

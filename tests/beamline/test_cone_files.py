@@ -19,7 +19,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
-from recon.axis_by_views import axis_by_views
+from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate

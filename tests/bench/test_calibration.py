@@ -19,9 +19,9 @@ import recon
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.calibration.freedom import knowable
-from recon.calibration.learn import learn_geometry
-from tests.recon.calibration.bodies import Bodies, balls, sponge
+from recon.features.calibration.freedom import knowable
+from recon.features.calibration.learn import learn_geometry
+from tests.recon.features.calibration.bodies import Bodies, balls, sponge
 
 VIEWS, SHAPE, NOISE = 80, (32, 80), 0.01
 METHOD = recon.FistaTv(8, tv_weight=3e-3)

@@ -21,7 +21,7 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.volume import Grid
-from recon.splatting.published import R2Published
+from recon.features.published.r2_published import R2Published
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import F32, OBJECTS, first_of, noisy, padded, seen_by_simulator
 

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from beamline.reconstruct.enough import GROWTH, EnoughViews
+from beamline.reconstruct.followed_views import GROWTH, EnoughViews
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid

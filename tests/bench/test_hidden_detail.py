@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import recon
-from beamline.projections.corrections.rings import Rings
+from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan

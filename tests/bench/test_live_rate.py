@@ -22,10 +22,10 @@ from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct.follow import follow
 from beamline.reconstruct.live_fit import ScanFollower
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import SourceOptions
@@ -165,10 +165,11 @@ def test_a_view_is_in_the_model_within_a_second(
     monkeypatch.setattr(optimise, "step", spy)
     monkeypatch.setattr(ScanFollower, "catch_up", end)
     method = R2(gaussians=50_000, seconds=1.0)
-    options = ReconOptions(SourceOptions(path), OutputPaths(tmp_path / "recon.h5", None), Selection(), method)
+    target, timing = OutputPaths(tmp_path / "recon.h5", None), FollowTiming()
+    options = ReconOptions(SourceOptions(path), target, Selection(), method, follow=timing)
     said = list[Event]()
     with pytest.raises(KeyboardInterrupt):
-        follow(options, said.append, clock)
+        reconstruct_file(options, said.append, clock)
     first = min(learnt.values())
     late = np.array([learnt.get(view, math.inf) - at for view, at in arrived.items() if at > first - period])
     steps = [event.data for event in said if event.event == "progress" and "step" in event.data][-1]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.protocols import PrepStep

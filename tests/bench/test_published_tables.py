@@ -29,9 +29,9 @@ import pytest
 import recon
 from recon.assess.metrics import psnr, ssim2d, ssim3d
 from recon.base.method import DataUse, RunControl
-from recon.fields.train import FieldMethod
+from recon.features.neural.train import FieldMethod
+from recon.features.published.r2_published import R2Published, published_fit
 from recon.methods import with_settings
-from recon.splatting.published import R2Published, published_fit
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import F32, Case, cone, diamond, seen_by_simulator, walnut_halved
 

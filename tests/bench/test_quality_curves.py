@@ -23,7 +23,7 @@ from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid
-from recon.bench import spheres
+from recon.features.bench.bench import spheres
 from recon.methods import build, by_name
 from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count

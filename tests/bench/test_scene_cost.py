@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from beamline.core.shipped import shipped_scenes
-from beamline.simulate.scene_file import open_scene
+from beamline.scenes.scene_file import open_scene
 from simulators.effects.catalogue import CATALOGUE
 from simulators.frame.shot import Shot
-from simulators.scenes.explain import explain
+from simulators.scenes.cost.explain import explain
 from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene
 
@@ -38,6 +38,7 @@ TYPICAL: dict[str, dict[str, Any]] = {
     "beam_hardening": {"weights": [0.5, 0.5], "ratios": [1.0, 1.5]},
     "beam_profile": {"sigma": [1.6, 0.8], "stripes": 0.03, "drift": 1e-5},
     "ring_current": {"lifetime": 36000.0},
+    "beam_bend": {"curvature": [0.1, 0.0]},
     "scatter": {"ratio": 0.01, "width_mm": 0.2},
     "scintillator_blur": {"fwhm_um": 3.0, "tail_share": 0.02, "tail_um": 60.0},
     "flat_structure": {"specks": 2000, "radius_um": 8.0},

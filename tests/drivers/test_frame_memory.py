@@ -73,7 +73,7 @@ def test_prepared_memory_is_there_before_the_frames(monkeypatch: pytest.MonkeyPa
     def refused(address: int, size: int) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr(module, "_lock", refused)
+    monkeypatch.setattr(module, "lock_pages", refused)
     memory = FrameMemory()
     assert memory.prepare(2, shape) == "Operation not permitted"
     assert faults_of_two_frames(memory) < 100

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
-from beamline.config.load import Config
-from beamline.instrument.connect import connect
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Monochromator, Watchable
 from drivers.epics.devices import MonochromatorPvs, PvMonochromator
 from drivers.manual import ManualMonochromator
-from tests.beamline.ball_scan import small
+from simulators.devices.clock import VirtualClock
+from simulators.devices.monochromator import SimulatedMonochromator
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
 
 ENERGIES = (8.3, 8.34, 8.3485, 8.3)
@@ -42,20 +42,17 @@ def _by_hand(opened: ExitStack, patch: pytest.MonkeyPatch) -> Rig:
 
 
 def _simulated(opened: ExitStack, patch: pytest.MonkeyPatch) -> Rig:
-    settings: Config = small("devices.monochromator={kind: simulated, settle_s: 2}")
-    device = opened.enter_context(connect(settings)).devices.monochromator
-    assert device is not None
-    told, show = list[float](), device._show  # type: ignore[attr-defined]
+    """Its scenes are their energies."""
+    told, refused = list[float](), list[bool]()
 
-    def shown(scene: object) -> None:
-        told.append(scene.beam.energy_kev)  # type: ignore[attr-defined]
-        show(scene)
+    def scene_at(energy: float) -> Any:
+        if refused:
+            raise DeviceError("monochromator", "there is no such scene")
+        return energy
 
-    def refuse(energy: float) -> None:
-        raise DeviceError("monochromator", "there is no such scene")
-
-    patch.setattr(device, "_show", shown)
-    return Rig(device, lambda: told, lambda: patch.setattr(device, "_scene_at", refuse))
+    show: Any = told.append
+    device = SimulatedMonochromator(7.0, scene_at, show, VirtualClock(), settle=2.0)
+    return Rig(device, lambda: told, lambda: refused.append(True))
 
 
 def _behind_pvs(per_kev: float, error_ev: float) -> Callable[..., Rig]:

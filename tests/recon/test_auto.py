@@ -144,3 +144,10 @@ def test_progress_counts_the_trials(data: F32) -> None:
     control = recon.RunControl(on_progress=seen.append)
     recon.reconstruct(data, VIEWS, Auto((Scaled(), Scaled(factor=2.0))), control=control)
     assert [(p.step, p.steps) for p in seen if p.unit == "methods tried"] == [(1, 2), (2, 2)]
+
+
+def test_views_of_zeros_are_refused() -> None:
+    with pytest.raises(ValueError, match="zero everywhere"):
+        recon.reconstruct(np.full((24, 40, 32), np.nan), VIEWS, Auto())
+    with pytest.raises(ValueError, match="zero everywhere"):
+        recon.reconstruct(np.zeros((24, 40, 32)), VIEWS, Auto())

@@ -33,7 +33,7 @@ class Counting:
 def test_the_rates_of_a_line_are_found_again(first: float, second: float, threads: int) -> None:
     clock = Counting()
     sizes = [(10.0, 20.0), (30.0, 600.0)]
-    timed = tuple(module._Timed(a, b, clock.taking(first * a + second * b)) for a, b in sizes)
+    timed = tuple(module.SizedRun(a, b, clock.taking(first * a + second * b)) for a, b in sizes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "OPERATIONS", {"sweep": lambda which: timed, "draw": lambda which: timed})
         shared, alone = (measured_rate(name, clock, threads) for name in ("sweep, parallel", "draw"))
@@ -44,15 +44,13 @@ def test_the_rates_of_a_line_are_found_again(first: float, second: float, thread
 @pytest.mark.parametrize("seconds", [(9.0, 3.0), (1.0, 900.0)])
 def test_no_rate_is_below_zero_on_a_busy_machine(seconds: tuple[float, float]) -> None:
     clock = Counting()
-    timed = tuple(
-        module._Timed(a, b, clock.taking(s)) for (a, b), s in zip([(10, 20), (30, 600)], seconds, strict=True)
-    )
-    found = module._rate(timed, clock)
+    timed = tuple(module.SizedRun(a, b, clock.taking(s)) for (a, b), s in zip([(10, 20), (30, 600)], seconds, strict=True))
+    found = module.rate_of(timed, clock)
     assert min(found) >= 0 and 30 * found.first + 600 * found.second == pytest.approx(seconds[1])
 
 
 @pytest.mark.parametrize("operation", ["sweep, parallel", "single sweep, parallel", "pass", "tv", "view, parallel"])
 def test_operations_run(operation: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_RUNS", 1)
+    monkeypatch.setattr(module, "RUNS", 1)
     rate = measured_rate(operation, time.process_time)
     assert isinstance(rate, Rate) and max(rate) > 0

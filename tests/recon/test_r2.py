@@ -135,20 +135,20 @@ def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
 
 @pytest.mark.parametrize(
     ("held_out", "message"),
-    [((False,) * 20 + (True,) * 4, "flatnonzero"), ((7,), r"views \[7\] are zero everywhere")],
+    [((False,) * 20 + (True,) * 4, "held_out must be .* whole numbers"), ((7,), r"views \[7\] are zero everywhere")],
 )
 def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: tuple[int, ...], message: str) -> None:
     blank = noisy.copy()
     blank[7] = 0
     with pytest.raises(ValueError, match=message):
         recon.reconstruct(blank, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=held_out))
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match="whole numbers, got"):
         recon.reconstruct(noisy, VIEWS, R2(steps=3, gaussians=100), use=DataUse(held_out=(2.9,)))  # type: ignore[arg-type]
 
 
 def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
     kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100)).checkpoint
-    with pytest.raises(ValueError, match=r"fit with at least 2\d views, these are 12"):
+    with pytest.raises(ValueError, match=r"least 2\d views"):
         recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 
 

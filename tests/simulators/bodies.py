@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.packing import rotation
+from simulators.samples.bodies.polyhedra import octahedron, plate, truncated_octahedron
 from simulators.samples.bodies.solids import (
     Box,
     Cylinder,
@@ -22,7 +23,6 @@ from simulators.samples.bodies.solids import (
     Solid,
     Vector,
 )
-from simulators.samples.builders.grains import octahedron, plate, truncated_octahedron
 
 Reals = NDArray[np.float64]
 

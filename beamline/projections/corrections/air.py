@@ -69,7 +69,7 @@ class Air:
     """
 
     name: ClassVar[str] = "background"
-    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    follows: ClassVar[tuple[str, ...]] = ("tilt", "phase", "jumps")
     needs_finished: ClassVar[str] = ""
     model: str = option(
         "--air",

@@ -122,6 +122,8 @@ def photons_of(
             raise ConfigError(
                 f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
             ) from error
+    # A mean of n frames has n times as many photons a count, too; flats and darks are single frames.
+    photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
     if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
         return None
     return photons

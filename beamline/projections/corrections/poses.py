@@ -1,19 +1,19 @@
-"""Poses of views from a file: displacement, roll and tilt, which become geometry. No view is resampled."""
+"""Poses of views from a file: displacement, roll and tilt, or vectors, become geometry. No view is resampled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
-from beamline.projections.corrections.calibrate import Calibrate
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import Unmoved
-from beamline.projections.selection import cone_of, pivot_of, pixel_size, with_pivot
+from beamline.projections.registry import geometry_steps
+from beamline.projections.selection import cone_of, pivot_of, pixel_size, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 from drivers.base.frame import FrameKind
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from recon.base.arrays import F64, I64
     from recon.base.geometry import Geometry
 
+_SAME_SIZE = 0.01  # of a pixel
 _OFF = 0.25  # of the step between two views: an angle that differs by more belongs to another view
 
 
@@ -46,14 +47,15 @@ class PosesOfFile:
     """
 
     name: ClassVar[str] = "poses"
-    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    follows: ClassVar[tuple[str, ...]] = ("tilt", "phase", "jumps")
     table: PoseTable | None = option(
         "--poses",
         None,
         "Displacement, roll and tilt of each view; no view is resampled. FILE is a CSV with the columns view or "
         "angle_deg, and shift_col_px, shift_row_px, roll_deg, tilt_deg; or a volume that has poses; or an NXtomo file "
-        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. ignore: do not use the shifts that "
-        "a .txrm states.",
+        "as FILE:x,-y: columns grow with x_translation, rows against y_translation. Or vectors of each view in mm, as "
+        "ASTRA has them: a CSV with ray_x (of a cone: src_x) to v_z, or an .npz with parallel3d_vec or cone_vec. "
+        "ignore: do not use the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
     )
@@ -101,6 +103,8 @@ class ScanPoses:
         sentence: in a line, what was read.
         pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
         binning: of the detector's pixels.
+        vectors: the geometry that the file states of its views, in the rows and with the binning used; None: no such.
+        view_of: int64 [frame], which of these views a frame is; -1: none.
     """
 
     shifts: F64
@@ -110,6 +114,15 @@ class ScanPoses:
     sentence: str
     pivot: float
     binning: int
+    vectors: Geometry | None = None
+    view_of: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+
+    @property
+    def axis_col(self) -> float:
+        """Column of the whole detector that the axis falls on by vectors, or the nearest one."""
+        assert self.vectors is not None
+        whole = self.binning * self.vectors.detector_shape[1]
+        return float(np.clip(self.binning * self.vectors.axis_col + (self.binning - 1) / 2, 0, whole - 1))
 
     @property
     def done(self) -> StepDone:
@@ -121,6 +134,8 @@ class ScanPoses:
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The geometry of these rows of the file in their poses."""
+        if self.vectors is not None:
+            return self.vectors.select(self.view_of[view_ids])
         posed = replace(
             geometry,
             shifts=geometry.shifts + self.shifts[view_ids] / self.binning,
@@ -145,9 +160,9 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
         raise ConfigError(
             f"--tilt turns views that {table.path} states as they were taken: write it to the roll_deg of --poses."
         )
-    if selection.step(Calibrate).geometry:
+    for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(
-            f"--calibrate learns what {table.path} states: give one of --calibrate and --poses, or --poses ignore."
+            f"{learns} learns what {table.path} states: give one of {learns} and --poses, or --poses ignore."
         )
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
@@ -162,7 +177,36 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
     pivot, sentence = pivot_of(source, selection), _sentence(table, shifts)
-    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
+    poses = ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
+    if table.vectors is None:
+        return poses
+    return replace(poses, vectors=_of_vectors(table, source, selection), view_of=rows)
+
+
+def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> Geometry:
+    """The views of a table of vectors, in the rows and with the binning of the selection."""
+    from recon.base.vectors import geometry_of_vectors
+
+    assert table.vectors is not None
+    if selection.axis_col is not None:
+        raise ConfigError(f"--axis: the vectors of {table.path} state where the axis falls. Leave it out.")
+    try:
+        views = geometry_of_vectors(table.vectors, source.shape, cone=table.cone)
+    except ValueError as error:
+        raise DataError(f"{table.path}: {error}. Nothing was read.") from error
+    if table.cone != (cone_of(source, selection) is not None):
+        need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
+        beam = "a cone" if table.cone else "a parallel beam"
+        raise ConfigError(f"{table.path} has vectors of {beam}, and {source.path} is not said to be one: {need}.")
+    size = pixel_size(source, selection)
+    if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
+        stated = "does not say its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
+        raise ConfigError(
+            f"{table.path} has vectors of pixels of {1e3 * views.pixel_pitch:.6g} um, {source.path} {stated}; expected "
+            "the same in mm. Give --pixel-size-um, or vectors in mm."
+        )
+    rows = rows_of(source, selection)
+    return views.rows(rows.start, rows.stop).binned(selection.binning)
 
 
 def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:
@@ -230,6 +274,8 @@ def require_stated(poses: ScanPoses, source: ScanSource, selection: Selection, v
 
 
 def _sentence(table: PoseTable, shifts: F64) -> str:
+    if table.vectors is not None:
+        return f"Vectors of {count(table.keys.size, 'view')} from {table.path} state the geometry."
     across, down = np.ptp(shifts, axis=0)
     roll, tilt = np.abs(table.turns_deg).max(axis=0)
     return (

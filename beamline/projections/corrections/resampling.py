@@ -12,7 +12,6 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.projections.corrections.counts import CountModel
-from beamline.projections.corrections.phase import Phase
 from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.selection import cone_of
 from beamline.projections.step import StepDone, StepMemory, option
@@ -237,7 +236,8 @@ def _refined(
 
 def _without_blur(selection: Selection) -> Selection:
     """The selection without the corrections that blur the views."""
-    return selection.with_steps(Phase(), CountModel("log"))
+    sharp = tuple(step for step in selection.steps if not getattr(step, "blurs", False))
+    return replace(selection, steps=sharp).with_steps(CountModel("log"))
 
 
 def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:

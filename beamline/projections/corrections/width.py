@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.protocols import ScanPart
+from beamline.projections.registry import geometry_steps
 from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Width:
     """
 
     name: ClassVar[str] = "width"
-    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    follows: ClassVar[tuple[str, ...]] = ("tilt", "phase", "jumps")
     spread: str = option(
         "--ray-width",
         "none",
@@ -108,10 +109,14 @@ class Width:
         blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         stated, motion = self._motion(source), _Motion(0.0, 0.0)
+        if (table := stated_poses(source, selection)) is not None and table.vectors is not None:
+            stated = None  # vectors are of the middle of an exposure
+            if self.arc not in ("auto", "none"):
+                raise ConfigError(f"--exposure-arc {self.arc}: views by vectors, of {table.path}, have none.")
         parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if stated is not None:
-            leaning = not geometry.is_straight or selection.step(Calibrate).may_lean
+            leaning = not geometry.is_straight or any(step.may_lean for step in geometry_steps(selection))
             bent = geometry.is_cone or leaning
             if self.arc != "auto":
                 motion = stated

@@ -73,6 +73,7 @@ class ScanSource(ABC):
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
             they were taken.
         numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
+        frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
     """
 
     path: Path
@@ -93,6 +94,12 @@ class ScanSource(ABC):
     row_pitch_mm: float | None = None
     in_order: bool = True
     numbers: NDArray[np.int64] | None = None
+    frames_per_view: int = 1
+
+    @property
+    def angle_text(self) -> tuple[str, str] | None:
+        """Name and content of a text with the angles that lies beside the frames, or None."""
+        return None
 
     @property
     def row_period(self) -> float | None:

@@ -408,7 +408,7 @@ def _quantity(said: str, dtype: np.dtype[Any]) -> Quantity:
 
 
 def _recognises(path: Path, opening: Opening) -> bool:
-    if not hdf5.is_hdf5(path, opening.follow):
+    if not path.is_file() or not hdf5.is_hdf5(path, opening.follow):
         return False
     with hdf5.open_hdf5(path, opening.follow) as file:
         return bool(find(file))

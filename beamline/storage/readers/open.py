@@ -16,13 +16,13 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
+from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
-from beamline.storage.readers.tiff_series import TiffSeriesSource
 from beamline.storage.readers.wrapped import (
     UNPACKED,
     CroppedSource,
@@ -32,21 +32,19 @@ from beamline.storage.readers.wrapped import (
     type_wrapped,
 )
 from drivers.base.frame import FrameKind
-from recon.base.registry import Registry
+from recon.base.registry import Registry, in_folders
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
 _SIGNED = "i1", "i2", "i4"  # types that cameras' counts may not fit
 _LOOKED_AT = 3  # frames of a kind, for counts that wrapped
 _PIXELS = 2**27  # of a frame whose rows are all looked at
-REGISTRY = (  # modules in this folder, asked in this order
-    "tiff_series",
-    "tiff_stack",
-    "txrm",
+REGISTRY = (  # modules in this folder, asked in this order; the first one before those in folders, the others after
     "nxtomo",
-    "emission",
     "dxchange",
 )
+_OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
+_MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
 
 
 def _fitting(name: str, found: Any) -> ScanFormat:
@@ -56,11 +54,10 @@ def _fitting(name: str, found: Any) -> ScanFormat:
 
 
 FORMATS: tuple[ScanFormat, ...] = tuple(
-    Registry(
-        "reader", {name: import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY}, _fitting
-    ).values()
+    Registry("reader", {name: import_module(module).FORMAT for name, module in _MODULES.items()}, _fitting).values()
 )
-"""Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
+"""Every format that is read, those of other packages last; adding one takes its file, and its line in REGISTRY
+or in FORMATS of a folder of formats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +83,7 @@ class SourceOptions:
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
+        frames_per_view: consecutive projections that are averaged to one; None: as many as the plan in the file says.
     """
 
     path: Path | str
@@ -102,6 +100,7 @@ class SourceOptions:
     horizontal_axis: bool = False
     earlier: tuple[Path, ...] = ()
     cols: tuple[int, int] | None = None
+    frames_per_view: int | None = 1
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The scan with these replacements; see `open_scan`."""
@@ -117,7 +116,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
     Raises:
         DataError: not there, not a format that we read, or not consistent; the message says what was found.
-        ConfigError: columns outside the detector.
+        ConfigError: columns outside the detector; a number of frames a view that is less than 1.
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
@@ -132,39 +131,48 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     try:
         if options.earlier:
             base = _of_parts(options.earlier, base)
-        series = base
+        angle_table, angles_from = _angle_table(options, base)
         if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
             base = UnsignedSource(base, dtype)
-        table = None if angles is None else load_angles(angles)
-        angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
-        if options.angles_path is not None:
-            angles_from = f"{options.angles_path} in {path}"
-            table = angles_at(path, options.angles_path, options.angles_unit)
-        if table is None and isinstance(series, TiffSeriesSource) and series.angle_text is not None:
-            angles_from = f"{series.angle_text[0]} in {path}"
-            table = parse_angles(series.angle_text[1], angles_from)
-        if options.angle_rows is not None:
-            if table is None:
-                raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
-            table = select_rows(table, options.angle_rows)
         if options.quantity == "transmission":
             darks, flats = _beam_of_one(base, options)
-        if any(given is not None for given in (table, darks, flats, options.quantity)):
+        n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
+        angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
+        if any(given is not None for given in (angles_of_all, darks, flats, options.quantity)):
             base = OverlaidSource(
                 base,
-                angles=table,
+                angles=angles_of_all,
                 angles_from=angles_from,
                 of_views=options.angle_rows is not None,
                 darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
                 flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
                 quantity="counts" if options.quantity == "transmission" else options.quantity,
             )
+        if n > 1:
+            base = AveragedSource(base, n)
         if options.horizontal_axis:
             base = TurnedSource(base)
         return base if options.cols is None else CroppedSource(base, options.cols)
     except BaseException:
         base.close()
         raise
+
+
+def _angle_table(options: SourceOptions, base: ScanSource) -> tuple[NDArray[np.float64] | None, str]:
+    """The angles that are given or stand beside a TIFF series, and where they come from; None: the scan's own."""
+    table = None if options.angles is None else load_angles(options.angles)
+    origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
+    if options.angles_path is not None:
+        origin = f"{options.angles_path} in {options.path}"
+        table = angles_at(Path(options.path), options.angles_path, options.angles_unit)
+    if table is None and base.angle_text is not None:
+        origin = f"{base.angle_text[0]} in {options.path}"
+        table = parse_angles(base.angle_text[1], origin)
+    if options.angle_rows is not None:
+        if table is None:
+            raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
+        table = select_rows(table, options.angle_rows)
+    return table, origin
 
 
 def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:

@@ -17,6 +17,8 @@ _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
 _MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
 
+RULE = "angle-order"
+
 
 def angles_in_order(source: ScanSource) -> Iterator[Finding]:
     """No frames that follow one another look alike where they are stated far apart, and others stated side by side do
@@ -45,7 +47,36 @@ def angles_in_order(source: ScanSource) -> Iterator[Finding]:
         if unlike_near > UNLIKE * unlike_far:
             yield _in_another_order(source, rows, jumps, far[0], near[0])
             return
-    yield from _alike_elsewhere(seen, rows[order])
+    if elsewhere := list(_alike_elsewhere(seen, rows[order])):
+        yield from elsewhere
+    elif source.cone is None and (pair := _mirrored_neighbours(seen, rows[order])) is not None:
+        text = _stated(source, pair)
+        yield Finding(
+            "warning",
+            RULE,
+            f"{text[0].upper()}{text[1:]} are mirror images, as views half a turn apart are. Unless the sample moved, "
+            "the angles were taken modulo 180 degrees, or frames lie in another order than their angles. Give one for "
+            "each projection, in their order, with --angles FILE.",
+        )
+
+
+def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> tuple[int, int] | None:
+    """Two frames that are stated side by side and look half a turn apart; None where none are. Rows by their angles.
+
+    A sample that is symmetric looks alike both ways, and one that moved looks unlike both ways.
+    """
+    some = some_of(rows, VIEWS)
+    some = some[[seen.lit(row) for row in some.tolist()]]
+    if some.size <= PAIRS:
+        return None
+    apart = np.diff(np.degrees(seen.source.angles[some]) % 360)
+    pairs = [(int(some[at]), int(some[at + 1])) for at in np.flatnonzero(apart <= _NEXT * np.median(apart))]
+    unlike = np.array([seen.unlike([pair], False) for pair in pairs])
+    usual = float(np.median(unlike))
+    for at in np.flatnonzero(unlike > UNLIKE * usual)[:PAIRS].tolist():
+        if seen.unlike([pairs[at]], True) < min(2 * usual, unlike[at] / UNLIKE):
+            return pairs[at]
+    return None
 
 
 def _apart(turned: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,12 +104,12 @@ def _in_another_order(
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * rows.size:
         wrong = ", ".join(f"{row} ({np.degrees(source.angles[row]):.6g})" for row in rows[single[:5]].tolist())
         text += f"The angles of {single.size} views are not between those of their neighbours: frames {wrong}. "
-        return Finding("warning", "angle-order", text + "Give the right ones with --angles FILE (degrees, one a line).")
+        return Finding("warning", RULE, text + "Give the right ones with --angles FILE (degrees, one a line).")
     text += (
         "The angles are not in the order of the frames. Give one for each projection, in their order, with "
         "--angles FILE."
     )
-    return Finding("warning" if source.plan else "error", "angle-order", text)
+    return Finding("warning" if source.plan else "error", RULE, text)
 
 
 def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Finding]:
@@ -115,7 +146,7 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Fin
     text = _stated(seen.source, pair)
     yield Finding(
         "warning",
-        "angle-order",
+        RULE,
         f"{text[0].upper()}{text[1:]} look more alike than neighbours, as {odd.sum()} of {some.size} views looked at "
         "do. Unless the sample is symmetric, the angles are not in the order of the frames, or the sample went round "
         "more often than they state.",

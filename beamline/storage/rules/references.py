@@ -15,7 +15,15 @@ from beamline.core.text import spans
 from beamline.monitor.digest import block_means, check_block, digest
 from beamline.monitor.flats_with_sample import brighter_in_places, flats_like_views, mass_missing, nothing_seen
 from beamline.monitor.odd_references import without_odd
-from beamline.monitor.references import Group, JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
+from beamline.monitor.references import (
+    BY_CHANCE,
+    Group,
+    JudgedGroup,
+    ReferenceFrame,
+    ReferenceLimits,
+    full_scale,
+    judge,
+)
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
@@ -231,7 +239,13 @@ def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
         frame = ReferenceFrame.seen(*about, saturated, block_means(image, block), block)
-        return replace(frame, cells=block_means(image, side))
+        held = np.bincount(image.ravel())
+        end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else int(image.max())
+        beside = BY_CHANCE if end == held.size - 1 else max(BY_CHANCE, int(held[end - 1]))
+        shared = (
+            max(0, int(held[end]) - beside) / image.size
+        )  # counts that thin out towards a few hot pixels do not end
+        return replace(frame, cells=block_means(image, side), largest=float(end), at_largest=shared)
     known = digest(image, saturation, block)
     frame = ReferenceFrame.of(*about, known, block)
     cells = digest(image, None, side).preview

@@ -29,6 +29,7 @@ from beamline.storage.writers.recon_file import (
     volumes_in_time,
     write_reconstruction,
 )
+from recon.base.registry import did_you_mean
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
@@ -46,7 +47,8 @@ def format_of(path: Path) -> VolumeFormat:
     if kind_of_file is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
         raise ValueError(
-            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}."
+            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}"
+            f"{did_you_mean(suffix, [each for kind in formats() for each in kind.suffixes])}."
         )
     return kind_of_file
 

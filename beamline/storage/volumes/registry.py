@@ -1,44 +1,28 @@
 """The registry of volume formats. It imports no format, so that help texts can use it at no cost.
 
-Adding one takes its class (`base.VolumeFormat`) in a module of this folder, and its line in REGISTRY.
+Adding one takes its class (`base.VolumeFormat`) in a module of this folder, and its line in REGISTRY, or in FORMATS of
+a folder of formats.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from recon.base.registry import Registry
+from beamline.storage.volumes.entry import FormatEntry
+from recon.base.registry import Registry, in_folders
 
 if TYPE_CHECKING:
     from beamline.storage.volumes.base import VolumeFormat
 
 
-@dataclass(frozen=True)
-class FormatEntry:
-    """A format of volume files.
-
-    Attributes:
-        suffixes: that a file's name ends in, the usual one first; "" for a folder.
-        note: what help says of it.
-    """
-
-    module: str
-    cls: str
-    suffixes: tuple[str, ...]
-    note: str = ""
-
-
 _HERE = "beamline.storage.volumes."
 REGISTRY = {
     "hdf5": FormatEntry(_HERE + "nxtomoproc", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
-    "tiff": FormatEntry(_HERE + "tiff", "TiffVolume", (".tif", ".tiff")),
-    "tiff_folder": FormatEntry(_HERE + "tiff", "TiffFolderVolume", ("",), "a folder of TIFFs"),
+    **in_folders("beamline.storage.volumes", "FORMATS"),
     "npy": FormatEntry(_HERE + "plain", "Npy", (".npy",)),
     "nrrd": FormatEntry(_HERE + "plain", "Nrrd", (".nrrd",)),
-    "ome_zarr": FormatEntry(_HERE + "ome_zarr", "OmeZarr", (".zarr",)),
 }
 
 

@@ -51,6 +51,24 @@ class _TouchedError(OSError):
     """Another program has cut or deleted the file while it was written."""
 
 
+def _new_file(path: Path) -> h5py.File:
+    """DataError where the file exists or HDF5 cannot make it; nothing is left of it then."""
+    try:
+        return h5py.File(path, "x", libver=layout.LIBVER)
+    except FileExistsError as error:
+        raise DataError(
+            f"{path} exists. A scan never overwrites a file: name a new one. Nothing was written."
+        ) from error
+    except OSError as error:
+        with suppress(OSError):  # made by HDF5, which then failed; one that was there is a FileExistsError
+            path.unlink()
+        if lock_failure(error) is LockFailure.NO_LOCKS:
+            why = no_locks_sentence(path.parent, error.errno)
+            raise DataError(f"{path} cannot be created: {why}. Nothing is left of it.") from error
+        why = hdf5.reason(error)
+        raise DataError(f"{path} cannot be created ({why}). Is its folder there and writable?") from error
+
+
 class NXtomoWriter:
     """Writes uint16 frames row by row; never overwrites a file.
 
@@ -85,20 +103,7 @@ class NXtomoWriter:
         self._preview_shape = preview_shape(self._shape, preview_bin)
         self._rows = self._committed = 0
         self._open, self._broken = True, False
-        try:
-            self._file = h5py.File(self.path, "x", libver=layout.LIBVER)
-        except FileExistsError as error:
-            raise DataError(
-                f"{self.path} exists. A scan never overwrites a file: name a new one. Nothing was written."
-            ) from error
-        except OSError as error:
-            with suppress(OSError):  # made by HDF5, which then failed; one that was there is a FileExistsError
-                self.path.unlink()
-            if lock_failure(error) is LockFailure.NO_LOCKS:
-                why = no_locks_sentence(self.path.parent, error.errno)
-                raise DataError(f"{self.path} cannot be created: {why}. Nothing is left of it.") from error
-            why = hdf5.reason(error)
-            raise DataError(f"{self.path} cannot be created ({why}). Is its folder there and writable?") from error
+        self._file = _new_file(self.path)
         try:
             layout.create(
                 self._file,

@@ -56,7 +56,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
         empty: without the voxels, for which there is one place, of zeros.
     """
     with hdf5.created(path) as file:
-        _write_entry(file, record, empty)
+        write_entry(file, record, empty)
         file.attrs["default"] = "entry"
 
 
@@ -69,7 +69,7 @@ def rewrite_facts(path: Path, record: ReconRecord) -> None:
         _write_facts(entry, record)
 
 
-def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
+def write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     entry = _group(file, "entry", "NXentry")
     entry.attrs["default"] = "data"
     _write_facts(entry, record)

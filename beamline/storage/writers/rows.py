@@ -19,6 +19,8 @@ from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 
+PER_FLUSH = 64  # rows that are written before a flush where nobody reads yet
+
 _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED])
 """56 bytes, little-endian, without gaps."""
 

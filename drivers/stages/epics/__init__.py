@@ -1,1 +1,3 @@
 """A motor record of EPICS as a stage."""
+
+DRIVERS = {"epics": "EpicsStage"}

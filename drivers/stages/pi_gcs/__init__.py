@@ -1,1 +1,3 @@
 """PI controllers that speak GCS 2.0 (C-863 class)."""
+
+DRIVERS = {"pi_gcs": "PiGcsStage"}

@@ -9,7 +9,7 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line import Probe
+from drivers.serial.line import Probe, line_to
 from drivers.serial.line_reader import Framing
 from drivers.stages.settings import Wiring
 
@@ -140,7 +140,7 @@ class GcsLine:
         """Whether a move has started; error messages depend on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
-        self._serial = wiring.line(url, name, clock, PROBE, framing=FRAMING)
+        self._serial = line_to(wiring, url, name, clock, PROBE, framing=FRAMING)
 
     def set(self, command: str) -> None:
         """Send a set command; raises if the register then has a code."""

@@ -1,1 +1,3 @@
 """Tsuji PM16C-04XD pulse-motor controller."""
+
+DRIVERS = {"pm16c": "PM16CStage"}

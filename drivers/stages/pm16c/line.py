@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
-from drivers.serial.line import Probe
+from drivers.serial.line import Probe, line_to
 from drivers.stages.settings import Wiring
 
 PROBE = Probe("STQ?", r"[RL][0-4]")
@@ -31,7 +31,7 @@ class PM16CLine:
         self.commanded = False
         """Whether a move has started; the text of an error depends on it."""
         self._name, self._clock = name, clock
-        self._serial = wiring.line(url, name, clock, PROBE, unsolicited=STOPPED_NOTE)
+        self._serial = line_to(wiring, url, name, clock, PROBE, unsolicited=STOPPED_NOTE)
 
     def send(self, command: str) -> None:
         """Send a command without waiting."""

@@ -1,1 +1,3 @@
 """Zaber rotary stages (ASCII protocol)."""
+
+DRIVERS = {"zaber": "ZaberStage"}

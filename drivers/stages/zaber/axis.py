@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
-from drivers.serial.line import Probe
+from drivers.serial.line import Probe, line_to
 from drivers.stages.kept import FoundSettings
 from drivers.stages.shared import while_it_moves
 from drivers.stages.zaber.packet import (
@@ -90,7 +90,8 @@ class ZaberAxis:
         self.found = FoundSettings()
         self.flags_at_opening: tuple[str, ...] = ()
         """Without that of a stop, which says nothing of where the stage is."""
-        self._line = wiring.line(
+        self._line = line_to(
+            wiring,
             url,
             name,
             clock,

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,11 +76,18 @@ def camera(geometry: Geometry, view: int) -> RayCamera:
     return RayCamera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight, *width)
 
 
+def seen_from(active: Active, geometry: Geometry, view: int) -> Active:
+    """The Gaussians about the view's centre, where its axes start."""
+    centre = geometry.centres[view]
+    return replace(active, means=active.means - centre.astype(np.float32)) if centre.any() else active
+
+
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
     """Footprints [n, 8] of all Gaussians in one view, rectified and affine; `faint` in units of the image."""
     table = footprint_table(active.densities.shape[0])
-    parameters = (active.means, active.scales, active.rotations, active.densities)
-    footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=active.kernel)
+    a = seen_from(active, geometry, view)
+    parameters = (a.means, a.scales, a.rotations, a.densities)
+    footprints(*parameters, camera(geometry, view), faint, sigmas, table, kernel=a.kernel)
     return table
 
 
@@ -111,7 +118,7 @@ class RenderedView:
 
     Attributes:
         image: line integrals [row, col].
-        active: the Gaussians; neither they nor `scratch` may change before `backward`.
+        active: the Gaussians about the view's centre; neither they nor `scratch` may change before `backward`.
         camera: the view.
         length: see `RayModel.length`.
         scratch: holds the table of footprints.
@@ -167,7 +174,7 @@ def render_view(
     `image` and `scratch` are overwritten (None: new ones). A view that shares `scratch` must have run `backward` before
     the next one is rendered.
     """
-    chosen, shape, a = model or RayModel(), geometry.detector_shape, active
+    chosen, shape, a = model or RayModel(), geometry.detector_shape, seen_from(active, geometry, view)
     picture = np.empty(shape, np.float32) if image is None else image
     buffers = Scratch.of(len(a.densities), shape) if scratch is None else scratch
     projection, length = camera(geometry, view), chosen.length(geometry)
@@ -185,7 +192,7 @@ def render_view(
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
         rays = CpuRays(some, projection, shape, faint, sigmas, a.kernel)
         rays.add_to(picture)
-    return RenderedView(picture, active, projection, length, buffers, exact, rays)
+    return RenderedView(picture, a, projection, length, buffers, exact, rays)
 
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:

@@ -1,6 +1,6 @@
 """Projector of rolled and tilted views and its adjoint: Joseph's interpolation along every ray (numba, threaded).
 
-With roll or tilt the rays to one column share no plane, so each ray has weights of its own. A ray is sampled once in
+With roll, tilt or centres the rays to one column share no plane: each has weights of its own. A ray is sampled once in
 every plane of voxels across one axis: the axis closest to the ray at the middle of its column. In a plane, voxel
 coordinates are ratios of linear functions of the row, so a short table for each column serves all its rays. Volumes are
 [y, x, z], projections [view, col, row]. The transpose reads the same weights and runs plane by plane: no two threads
@@ -48,7 +48,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     a_row = np.broadcast_to(along_row[:, None] * pitch, at_row_0.shape)
     beams, nothing = np.broadcast_to(beam[:, None], at_row_0.shape), np.zeros_like(at_row_0)
     if geometry.is_cone:
-        start, start_row = -geometry.sod * beams, nothing
+        start, start_row = geometry.centres[:, None, ::-1] - geometry.sod * beams, nothing
         run, run_row = at_row_0 + geometry.sdd * beams, a_row
     else:
         start, start_row, run, run_row = at_row_0, a_row, beams, nothing

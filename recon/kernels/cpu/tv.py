@@ -19,6 +19,7 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
 _NO_FLOOR = -3.0e38
+_FASTEST = 1e15  # pace: squares of the dual fields stay within float32, and one step saturates any difference
 _APART = 17 * 16  # values: 17 lines of the cache
 _PIECE = 512  # voxels of one loop, about
 Weights = tuple[float, float, float]
@@ -154,7 +155,7 @@ def dual_step(
         back: of the first two axes: 1 where |p| of a voxel takes the difference from the voxel before, 0 where it
             takes the one to the next. It is total variation as a mirror image sees it.
     """
-    pace = 1.5 / (4 * sum(w * w for w in weights)) / threshold
+    pace = min(1.5 / (4 * sum(w * w for w in weights)) / threshold, _FASTEST)
     floor = 0.0 if nonnegative else _NO_FLOOR
     _dual_step(*_in_planes(x, *p), x.shape[2], threshold, pace, weights, floor, *back, *scratch)
 

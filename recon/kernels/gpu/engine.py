@@ -60,15 +60,19 @@ class GpuView:
         if geometry.width:
             raise ValueError(f"rays with a width ({geometry.width}) are projected on the CPU only: use device 'cpu'")
         self._run, self._geometry, self._view, self._length = run, geometry, view, model.length(geometry)
+        means, scales, rotations, densities = run.active
+        if geometry.centres[view].any():  # where the view's axes start
+            means = means - means.new_tensor(geometry.centres[view])
+        self._active = means, scales, rotations, densities
         self.footprints = footprints(
-            *run.active, geometry, view, faint, cut, self._length, model.exact_above, run.kernel
+            *self._active, geometry, view, faint, cut, self._length, model.exact_above, run.kernel
         )  # fmt: skip
         self.image = render(self.footprints, geometry.detector_shape, run.kernel)
         self._rays: tuple[Tensor, GpuRays] | None = None
         if geometry.is_cone and model.exact_above < math.inf:  # their number is only known after waiting for the device
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
-                means, scales, rotations, densities = (array[exact] for array in run.active)
+                means, scales, rotations, densities = (array[exact] for array in self._active)
                 rays = GpuRays((means, scales, rotations, densities), geometry, view, faint, cut, run.kernel)
                 rays.add_to(self.image)
                 self._rays = (exact, rays)
@@ -77,7 +81,7 @@ class GpuView:
         run, found = self._run, self.footprints
         centres = found.table.new_empty((found.table.shape[0], 2))
         footprints_backward(
-            found, moments(found, gradient, run.kernel), *run.active, self._geometry, self._view, *run.into, centres,
+            found, moments(found, gradient, run.kernel), *self._active, self._geometry, self._view, *run.into, centres,
             self._length, run.kernel,
         )  # fmt: skip
         if self._rays is not None:

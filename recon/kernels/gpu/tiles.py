@@ -1,4 +1,4 @@
-"""tile_lists: the Gaussians that touch each tile of an image or brick of voxels, by counting and one sort (torch).
+"""tile_lists: the Gaussians that touch each tile of an image or brick of voxels, by counting and one sort.
 
 A pixel is a sum, so the order within a tile is free; a stable sort makes it the same in every run.
 """
@@ -10,9 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import triton
+import triton.language as tl
 from torch import Tensor
 
-_PROGRAMS = 4096  # programs that keep a large device busy
+PROGRAMS = 4096  # programs that keep a large device busy
+_BLOCK = 256
 _LEAST = 32  # Gaussians that a part of a list should hold at least
 
 
@@ -37,7 +40,41 @@ class TileLists:
     @property
     def shares(self) -> int:
         """Number of parts of each list, each with a layer of its own, so that few tiles still occupy a device."""
-        return max(1, min(_PROGRAMS // self.n_tiles, self.owners.shape[0] // (_LEAST * self.n_tiles)))
+        return max(1, min(PROGRAMS // self.n_tiles, self.owners.shape[0] // (_LEAST * self.n_tiles)))
+
+
+@triton.jit(do_not_specialize=["n"])
+def _touched(boxes, touched, n, edge, AXES: tl.constexpr, BLOCK: tl.constexpr):
+    """How many tiles each box touches, int64 [n]."""
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tiles = tl.full((BLOCK,), 1, tl.int64)
+    for axis in tl.static_range(AXES):
+        low = tl.load(boxes + 2 * (AXES * i + axis), i < n, 0)
+        high = tl.load(boxes + 2 * (AXES * i + axis) + 1, i < n, 0)
+        tiles *= tl.where(high > low, (high - 1) // edge - low // edge + 1, 0)
+    tl.store(touched + i, tiles, i < n)
+
+
+@triton.jit(do_not_specialize=["pairs"])
+def _tile_of_pairs(
+    boxes, owners, ends, tiles, pairs, edge, tiles_y, tiles_x, AXES: tl.constexpr, BLOCK: tl.constexpr
+):  # fmt: skip
+    """The tile of each pair of a Gaussian and a tile that it touches, int32 [pairs]."""
+    pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    held = pair < pairs
+    owner = tl.load(owners + pair, held, 0)
+    rank = (tl.load(ends + owner, held, 1) - 1 - pair).to(tl.int32)  # from the last tile of the box to the first
+    tile, stride = tl.zeros((BLOCK,), tl.int32), 1
+    for back in tl.static_range(AXES):
+        axis = AXES - 1 - back
+        low = tl.load(boxes + 2 * (AXES * owner + axis), held, 0)
+        high = tl.load(boxes + 2 * (AXES * owner + axis) + 1, held, 1)
+        first = low // edge
+        span = tl.maximum((high - 1) // edge - first + 1, 1)
+        tile += (first + rank % span) * stride
+        rank = rank // span
+        stride *= tiles_x if back == 0 else tiles_y
+    tl.store(tiles + pair, tile, held)
 
 
 def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int) -> TileLists:
@@ -46,28 +83,24 @@ def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int) -> TileLists:
     Raises:
         MemoryError: where there are 2^31 or more pairs of a Gaussian and a tile.
     """
-    counts = tuple(-(-size // edge) for size in shape)
-    low, high = boxes[:, 0::2], boxes[:, 1::2]
-    first = low // edge
-    spans = torch.where(high > low, (high - 1) // edge - first + 1, 0)
-    ends = spans.prod(1, dtype=torch.int64).cumsum(0)
-    # The only number read from the device: the length of the lists.
-    pairs = int(ends[-1]) if len(boxes) > 0 else 0
+    counts, n, device = tuple(-(-size // edge) for size in shape), len(boxes), boxes.device
+    touched = torch.empty(n, dtype=torch.int64, device=device)
+    if n > 0:
+        _touched[(triton.cdiv(n, _BLOCK),)](boxes, touched, n, edge, AXES=len(counts), BLOCK=_BLOCK)
+    ends = touched.cumsum(0)
+    pairs = int(ends[-1]) if n > 0 else 0  # the only number read from the device: the length of the lists
     if pairs >= 2**31:
         raise MemoryError(
-            f"{len(boxes)} Gaussians touch {pairs} tiles of edge {edge}, more than lists hold (2^31); "
+            f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than lists hold (2^31); "
             "take a smaller image or grid, or fewer or smaller Gaussians"
         )
-    device = boxes.device
-    owner = torch.searchsorted(ends, torch.arange(pairs, device=device), right=True)
-    spans, first = spans[owner], first[owner]
-    rank = torch.arange(pairs, device=device) - (ends[owner] - spans.prod(1))
-    tile, stride = torch.zeros_like(rank), 1
-    for axis in reversed(range(len(counts))):
-        tile += (first[:, axis] + rank % spans[:, axis]) * stride
-        rank = rank // spans[:, axis]
-        stride *= counts[axis]
-    tile, order = torch.sort(tile.to(torch.int32), stable=True)
+    tile = torch.empty(pairs, dtype=torch.int32, device=device)
+    owners = torch.searchsorted(ends, torch.arange(pairs, device=device), right=True, out_int32=True)
+    if pairs > 0:
+        _tile_of_pairs[(triton.cdiv(pairs, _BLOCK),)](
+            boxes, owners, ends, tile, pairs, edge, counts[-2], counts[-1], AXES=len(counts), BLOCK=_BLOCK,
+        )  # fmt: skip
+    tile, order = torch.sort(tile, stable=True)
     edges = torch.arange(math.prod(counts) + 1, device=device, dtype=torch.int32)
     starts = torch.searchsorted(tile, edges, out_int32=True)
-    return TileLists(owner[order].to(torch.int32), starts, counts)
+    return TileLists(owners[order], starts, counts)

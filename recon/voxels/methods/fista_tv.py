@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 from recon.base.arrays import F32
+from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.voxels.held_out import HeldOutTrial, choose_weight
-from recon.voxels.iterative import run_iterative
+from recon.voxels.iterative import TV_WEIGHT_CHOSEN, run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
 from recon.voxels.sweeps import interleaved
@@ -45,7 +46,7 @@ class FistaTv:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        check_settings(self, whole={"subsets": 1, "tv_steps": 1}, least={"tv_weight": 0.0})
+        check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 1}, least={"tv_weight": 0.0})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
@@ -62,23 +63,26 @@ class FistaTv:
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
+        unit = density_unit(x)
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.iterations, trial)
         else:
             share = self.tv_weight
-            weight = problem.decide(
-                "weight", lambda: share * density_unit(x) * largest_eigenvalue(projector, problem.weight)
-            )
-        subsets = Subsets.of(problem, self.subsets)
+            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(projector, problem.weight))
+        subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
+        if self.tv_weight is None and unit > 0:
+            used = weight.value if isinstance(weight, NoiseBalance) else weight
+            problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used * subsets.step / len(subsets.views) / unit))
         return x, weight
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        start = ordered_sweeps(geometry, grid, 1, 9) + power_rounds(geometry, grid, subsets_of(geometry, self.subsets))
-        sweeps = fista_sweeps(geometry, grid, self.iterations, self.subsets, self.tv_steps)
+        count = subsets_of(geometry, self.subsets, FEWEST_SUBSETS)
+        start = ordered_sweeps(geometry, grid, 1, 9) + power_rounds(geometry, grid, count)
+        sweeps = fista_sweeps(geometry, grid, self.iterations, self.subsets, self.tv_steps, FEWEST_SUBSETS)
         choice = weight_choice(geometry, grid) if self.tv_weight is None else Work()
         return Costs({self.name: start + sweeps}, choice)
 

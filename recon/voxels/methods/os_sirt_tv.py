@@ -14,7 +14,7 @@ from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.voxels.held_out import choose_weight
-from recon.voxels.iterative import run_iterative
+from recon.voxels.iterative import TV_WEIGHT_CHOSEN, run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
@@ -49,7 +49,7 @@ class OsSirtTv:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        check_settings(self, least={"tv_weight": 0.0})
+        check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 0}, least={"tv_weight": 0.0})
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
@@ -60,6 +60,7 @@ class OsSirtTv:
         prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, self.tv_steps)
         scale = problem.scale
         weight: NoiseBalance | float | None = None
+        threshold = 0.0
         ahead = Momentum(x, problem.decide) if self.momentum else None
         for k in range(self.iterations):
             error = sweeps.run(x, 1.0, problem.nonnegative, problem.rng)
@@ -68,7 +69,8 @@ class OsSirtTv:
                 if isinstance(weight, NoiseBalance):
                     weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
                 mu = weight.value if isinstance(weight, NoiseBalance) else weight
-                prox(x, float(mu * problem.decide("pace", lambda: sweeps.pace)))
+                threshold = float(mu * problem.decide("pace", lambda: sweeps.pace))
+                prox(x, threshold)
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
@@ -77,6 +79,8 @@ class OsSirtTv:
                 break
             if ahead is not None:
                 ahead(x)
+        if self.tv_weight is None and (unit := density_unit(x)) > 0:
+            problem.decide(TV_WEIGHT_CHOSEN, lambda: threshold / unit)
         return x
 
     def toy(self) -> Self:

@@ -52,7 +52,7 @@ class PnpDct:
     allow_negative: bool = False
 
     def __post_init__(self) -> None:
-        check_settings(self, least={"patch_threshold": 0.0})
+        check_settings(self, whole={"iterations": 1}, least={"patch_threshold": 0.0})
 
     @property
     def first_sweeps(self) -> int:

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from recon.base.registry import in_folders
 from simulators.frame.mapping import SceneError, build, choose, located, named
 from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import SOLIDS
-from simulators.samples.builders.piece import Piece, PieceBuilder
-from simulators.samples.composed.parts import Part, sample_of
-from simulators.samples.sample import Changing, Sample
+from simulators.samples.bodies.solids import SOLIDS, Solid, kind_of
+from simulators.samples.sample import Sample
 
 if TYPE_CHECKING:
-    from simulators.light.palette import Palette
-    from simulators.samples.voxels.volume import ReadVolume
+    from simulators.samples.sample import ReadVolume
 
     _Builder = Callable[[str, Mapping[str, Any], Beam, ReadVolume | None], Sample]
-
-
-_OWN_KEYS = ("material", "instead_of", "name")
 
 
 def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = None) -> Sample:
@@ -58,123 +53,54 @@ class _Keys:
 
 
 def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    """The sample of a phantom's `solids` and `materials`; see simulators.light.palette for the latter."""
+    """The sample of a phantom's `solids`, grey where no key asks for the module of a folder."""
     keys = build(_Keys, where, mapping)
     entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
-    used = {key for _, entry in entries if isinstance(entry, Mapping) for key in entry}
-    palette = None
-    if "materials" in mapping or used & {"material", "instead_of"}:
-        from simulators.light.palette import palette_of
+    used = {*mapping, *(key for _, entry in entries if isinstance(entry, Mapping) for key in entry)}
+    modules = in_folders("simulators.samples", "SOLID_KEYS")
+    if found := [module for key, module in modules.items() if key in used]:
+        sample: Sample = import_module(found[0]).phantom(where, entries, keys.materials, beam)
+        return sample
+    grey = [_grey(at, entry) for at, entry in entries]
+    return Phantom.of([solid for solid, _ in grey], [name for _, name in grey])
 
-        palette = palette_of(f"{where}.materials", keys.materials)
-    parts = [_part(at, entry, palette) for at, entry in entries]
-    return sample_of(parts, beam, None if palette is None else palette.filters)
 
-
-def _part(where: str, entry: Any, palette: Palette | None) -> Part:
-    """`palette`: None where the scene names no material."""
+def _grey(where: str, entry: Any) -> tuple[Solid, str]:
+    """A solid and its label."""
     if not isinstance(entry, Mapping):
-        return Part(choose(where, SOLIDS, entry))
-    own = {key: entry[key] for key in _OWN_KEYS if key in entry}
-    rest = {key: value for key, value in entry.items() if key not in _OWN_KEYS}
-    if wrong := {key: value for key, value in own.items() if not isinstance(value, str)}:
-        raise SceneError(f"{where}: {', '.join(wrong)} must be text, got {wrong}")
-    if "material" in own and "attenuation" in rest:
-        raise SceneError(f"{where}: attenuation and material exclude each other; give one of them")
+        solid = choose(where, SOLIDS, entry)
+        return solid, kind_of(solid)
+    name = entry.get("name", "")
+    if not isinstance(name, str):
+        raise SceneError(f"{where}: name must be text, got { {'name': name} }")
     with located(where):
-        materials = {key: palette(own[key]) for key in ("material", "instead_of") if palette and key in own}
-        solid = choose(where, SOLIDS, rest | ({"attenuation": 1.0} if materials else {}))
-        return Part(solid, **materials, name=own.get("name"))
+        solid = choose(where, SOLIDS, {key: value for key, value in entry.items() if key != "name"})
+        return solid, name or kind_of(solid)
 
 
-def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    from simulators.samples.voxels.volume import VolumeSettings, voxels_of
-
-    settings = build(VolumeSettings, where, mapping)
-    if read is None:
-        raise ValueError(f"{settings.file} cannot be read: no reader of volume files was given")
-    return voxels_of(settings, read)
-
-
-def _mesh(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    from simulators.samples.voxels.mesh import MeshSettings, mesh_of
-
-    settings = build(MeshSettings, where, mapping)
-    if read is None:
-        raise ValueError(f"{settings.file} cannot be read: no reader of meshes was given")
-    return mesh_of(settings, read)
-
-
-def _pieces(cls: str) -> _Builder:
-    """The builder of a phantom of pieces, which are materials if the beam has energies and the scene no attenuation."""
+def _read(module: str) -> _Builder:
+    """The builder of a phantom that is read from a file: `phantom` of the module."""
 
     def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-        kind = getattr(import_module(f"simulators.samples.builders.{cls.lower()}"), cls)
-        rest = {key: mapping[key] for key in mapping if key not in ("materials", "change")}
-        settings: PieceBuilder = build(kind, where, rest)
-        first = settings.pieces()
-        of_materials = beam.has_energy and not settings.attenuation
-        if not of_materials and (settings.made_of or "materials" in mapping):
-            raise SceneError(f"{where}: materials need a beam with energies (energy_kev) and no attenuation")
-
-        def made_of(pieces: Sequence[Piece]) -> Sample:
-            if of_materials:
-                material_of = {**settings.default_materials, **settings.made_of}
-                return _of_materials(where, pieces, material_of, mapping.get("materials"), beam)
-            return _grey(pieces, {**settings.default_attenuation, **settings.attenuation})
-
-        if "change" not in mapping:
-            return made_of(first)
-        from simulators.samples.builders.change import CHANGES
-
-        change = choose(f"{where}.change", CHANGES, mapping["change"])
-
-        def at(seconds: float) -> Sample:
-            with located(f"{where}.change"):
-                return made_of(change.at(first, seconds))
-
-        return Changing(at, at(0.0))
+        phantom: Sample = import_module(module).phantom(where, mapping, read)
+        return phantom
 
     return sample
 
 
-def _grey(pieces: Sequence[Piece], attenuation: Mapping[str, float]) -> Sample:
-    """The pieces with an attenuation (1/mm) for each role, for any beam."""
-    solids = []
-    for piece in pieces:
-        contrast = attenuation[piece.role] - attenuation.get(piece.instead_of or "", 0.0)
-        solids.append(replace(piece.solid, attenuation=contrast * piece.solid.attenuation))
-    return Phantom.of(solids, [piece.role for piece in pieces])
+def _built(name: str, module: str) -> _Builder:
+    """The builder of a phantom out of pieces: `phantom` of the module."""
 
+    def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
+        phantom: Sample = import_module(module).phantom(name, where, mapping, beam)
+        return phantom
 
-def _of_materials(
-    where: str, pieces: Sequence[Piece], material_of: Mapping[str, str], materials: Any, beam: Beam
-) -> Sample:
-    """The pieces with a material for each role; `materials` are the scene's own, see simulators.light.palette."""
-    from simulators.light.palette import palette_of
-    from simulators.samples.composed.parts import Part, sample_of
-
-    palette = palette_of(f"{where}.materials", materials)
-    used = {role for piece in pieces for role in (piece.role, piece.instead_of) if role is not None}
-    material_by_role = {role: palette(material_of[role]) for role in sorted(used)}
-    parts = [
-        Part(
-            piece.solid,
-            material_by_role[piece.role],
-            material_by_role[piece.instead_of] if piece.instead_of else None,
-            piece.role,
-        )
-        for piece in pieces
-    ]
-    return sample_of(parts, beam, palette.filters)
+    return sample
 
 
 _KINDS: Mapping[str, _Builder] = {
     "battery": _battery,
     "solids": _solids,
-    "cathode": _pieces("Cathode"),
-    "foam": _pieces("Foam"),
-    "resolution": _pieces("Resolution"),
-    "volume": _volume,
-    "mesh": _mesh,
+    **{name: _built(name, module) for name, module in in_folders("simulators.samples.builders", "PHANTOMS").items()},
+    **{name: _read(module) for name, module in in_folders("simulators.samples", "PHANTOMS").items()},
 }

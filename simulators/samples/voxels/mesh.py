@@ -7,15 +7,16 @@ The mesh keeps its place: z of the file is the rotation axis. A voxel has the sh
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from simulators.frame.mapping import Positive
-from simulators.samples.voxels.volume import ReadVolume
+from simulators.frame.mapping import Positive, build
+from simulators.samples.sample import ReadVolume
 from simulators.samples.voxels.voxels import Voxels
 
 Reals = NDArray[np.float64]
@@ -136,3 +137,11 @@ def _left(a: Reals, b: Reals, px: float, py: float, anticlockwise: bool) -> bool
     p, q = (b, a) if flipped else (a, b)
     on_left = (q[0] - p[0]) * (py - p[1]) - (q[1] - p[1]) * (px - p[0]) >= 0
     return on_left == (anticlockwise != flipped)
+
+
+def phantom(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Voxels:
+    """The sample of a scene's mapping; `where`: its path, for messages. Raises SceneError and ValueError."""
+    settings = build(MeshSettings, where, mapping)
+    if read is None:
+        raise ValueError(f"{settings.file} cannot be read: no reader of meshes was given")
+    return mesh_of(settings, read)

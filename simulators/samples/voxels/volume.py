@@ -13,37 +13,21 @@ phantom:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.frame.detector import Detector
-from simulators.frame.mapping import Positive
+from simulators.frame.mapping import Positive, build
 from simulators.frame.pose import Pose
+from simulators.samples.sample import ReadVolume, Stored
 from simulators.samples.voxels.voxels import Voxels
 
 MOST_COLUMNS = 100_000
 VIEWS = 8  # Views over half a turn in which the largest line integral is searched
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """A volume as stored in a file.
-
-    Attributes:
-        values: [z, y, x] or in another order that the scene gives, real numbers in the file's own units.
-        spacing: mm from voxel to voxel along the same axes; None: the file does not state it.
-    """
-
-    values: NDArray[np.generic]
-    spacing: tuple[float, float, float] | None = None
-
-
-ReadVolume = Callable[[str, str | None], Stored]
-"""Reads the file that a scene names, and a dataset in it. The caller of `load_scene` provides it, since simulators open
-no files; its errors pass through."""
 
 
 @dataclass(frozen=True)
@@ -158,3 +142,11 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
             raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
         return settings.largest_line_integral / most
     return 1.0
+
+
+def phantom(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Voxels:
+    """The sample of a scene's mapping; `where`: its path, for messages. Raises SceneError and ValueError."""
+    settings = build(VolumeSettings, where, mapping)
+    if read is None:
+        raise ValueError(f"{settings.file} cannot be read: no reader of volume files was given")
+    return voxels_of(settings, read)

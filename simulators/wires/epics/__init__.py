@@ -1,1 +1,3 @@
 """A simulated motor record."""
+
+CONTROLLERS = {"epics": "EpicsBuild"}

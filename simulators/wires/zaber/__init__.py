@@ -1,1 +1,3 @@
 """Simulated Zaber device."""
+
+CONTROLLERS = {"zaber": "ZaberBuild"}

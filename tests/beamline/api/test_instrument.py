@@ -43,13 +43,15 @@ def closed() -> list[FakeInstrument]:
 def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: list[FakeInstrument]) -> Connected:
     """`connect` that finds a fake instrument where the devices would be; runs come into `tmp_path`."""
 
-    def connect(fake: FakeInstrument | None = None, **values: object) -> api.Instrument:
+    def connect(
+        fake: FakeInstrument | None = None, say: Callable[[str], None] | None = None, **values: object
+    ) -> api.Instrument:
         fake = fake or FakeInstrument()
         monkeypatch.setattr(
             "beamline.instrument.connect.connect",
             lambda config, ask=None: replace(fake.connected(), close=lambda: closed.append(fake)),
         )
-        return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, say=None)
+        return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, say=say)
 
     return connect
 
@@ -171,7 +173,7 @@ def test_events_and_sentences_are_those_of_the_command(
     with connected() as instrument:
         instrument.scan(on_event=lambda event: heard.append(event.event))
         assert capsys.readouterr() == ("", "")
-        instrument._say = api.to_stderr
+    with connected(say=api.to_stderr) as instrument:
         instrument.scan()
     assert {"run_started", "state", "scan_done", "done"} <= set(heard)
     out, err = capsys.readouterr()

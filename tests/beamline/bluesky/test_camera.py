@@ -14,8 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.features.files.nexus import nexus_findings
 from beamline.instrument.connect import connect
-from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.writers.ending import ScanEnding, ending_in
 from drivers.base.protocols import TriggerTrain
 from tests.beamline import ran

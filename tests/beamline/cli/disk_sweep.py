@@ -26,10 +26,10 @@ from typing import Any
 import h5py
 import numpy as np
 
+from beamline.features.trials import runner
+from beamline.features.trials.data import write_array
+from beamline.features.trials.trial import Outcome, Trial
 from beamline.report import figures
-from beamline.trials import runner
-from beamline.trials.data import write_array
-from beamline.trials.trial import Outcome, Trial
 from tests.beamline.conftest import BlankCanvas
 
 _FAULTS = {
@@ -39,13 +39,13 @@ _FAULTS = {
     "kill": (1, 0, 0, 0),
 }
 _MODULES = {
-    "export": "cli.export",
-    "ingest": "cli.files storage.ingest",
-    "archive": "cli.files",
-    "recon": "cli.recon reconstruct.job reconstruct.offline reconstruct.recon_report report.figures",
-    "segment": "cli.segment",
-    "tradeoff": "cli.tradeoff trials.tradeoff",
-    "study": "cli.study trials.study trials.figures",
+    "export": "features.export.command",
+    "ingest": "features.files.command features.files.ingest",
+    "archive": "features.archive.command",
+    "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
+    "segment": "features.particles.command",
+    "tradeoff": "features.trials.tradeoff_command features.trials.tradeoff",
+    "study": "features.trials.study_command features.trials.study features.trials.figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 

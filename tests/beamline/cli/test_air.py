@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -48,6 +49,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return bent_and_straight(SCENE, tmp_path_factory.mktemp("air"))
 
 
+@cache
 def _prepared(path: Path, model: str = "auto", buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
         return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer)

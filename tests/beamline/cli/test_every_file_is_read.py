@@ -1,6 +1,6 @@
 """Every file that a command writes is read by every command that claims to: all pairs of both.
 
-Series in time are read in test_recon_series.py.
+Series in time are read in tests/recon/features/joint/test_command.py.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import pytest
 
 from beamline.page.volume import ShownVolume
 from beamline.reconstruct.measure import read_truth
-from beamline.simulate.scene_file import volumes_beside
+from beamline.simulate.volumes import volumes_beside
 from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
@@ -179,7 +179,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "histogram.png": ("info", "simulated.h5", "--statistics", "-o"),
     "checkpoint.h5": ("recon", "simulated.h5", "-m", "r2", "--steps", "9", "-o", "v.h5", "--no-report", "--checkpoint"),
     "log.txt": ("recon", "simulated.h5", "-m", "fbp", "-o", "v.h5", "--no-report", "--log"),
-    "axis.png": ("recon", "simulated.h5", "-m", "fbp", "--axis", "try:14:17:1", "-o"),
+    "sweep.png": ("sweep", "simulated.h5", "axis=14:17:1", "-o"),
     "study": ("study", "fixed-views", "simulated.h5", "-o"),
     "tradeoff": ("tradeoff", "simulated.h5", "-o"),
     "batch": ("batch", "simulated.h5", "-o"),

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.storage.ingest import ingest
+from beamline.features.files.ingest import ingest
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from recon.base.volume import Grid, Volume
 from tests import faulty_disk

@@ -12,8 +12,9 @@ from tests.beamline.scans import write_exchange
 
 LOADS = """
 import contextlib, io, sys
-from beamline.cli.main import _COMMANDS, main
-for name in _COMMANDS:
+from beamline.cli.commands import commands
+from beamline.cli.main import main
+for name in commands():
     assert main.get_command(None, name) is not None
 for words in ["--help"], ["recon", "--help-all"]:
     with contextlib.redirect_stdout(io.StringIO()):

@@ -19,9 +19,9 @@ from click.shell_completion import get_completion_class
 from click.testing import CliRunner
 
 from beamline.cli import main as module
-from beamline.cli import man
 from beamline.core import errors
 from beamline.core.errors import INTERRUPTED, leave_traceback, user_message
+from beamline.features.completion import command as man
 from drivers.base.errors import DeviceError, DeviceTimeout
 
 
@@ -34,7 +34,7 @@ def _raiser(error: BaseException) -> Callable[[], None]:
 
 def _run(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> click.testing.Result:
     fake = SimpleNamespace(demo=click.command("demo")(_raiser(error)))
-    monkeypatch.setattr(module, "import_module", lambda name: fake)
+    monkeypatch.setattr("beamline.cli.commands.import_module", lambda name: fake)
     return CliRunner().invoke(module.main, ["demo"])
 
 
@@ -108,7 +108,7 @@ def test_a_developer_sees_the_defect_itself(
     monkeypatch: pytest.MonkeyPatch, arguments: list[str], environment: dict[str, str]
 ) -> None:
     fake = SimpleNamespace(demo=click.command("demo")(_raiser(ZeroDivisionError())))
-    monkeypatch.setattr(module, "import_module", lambda name: fake)
+    monkeypatch.setattr("beamline.cli.commands.import_module", lambda name: fake)
     result = CliRunner().invoke(module.main, [*arguments, "demo"], env=environment)
     assert isinstance(result.exception, ZeroDivisionError)
 

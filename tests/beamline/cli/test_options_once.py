@@ -17,8 +17,8 @@ from beamline.projections.registry import registered
 from beamline.projections.selection import Selection
 from beamline.projections.step import key_of, options_of
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.option_rules import AXIS_TRIALS, RULES, SLABS_RESUMED, OptionRule, takers
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.option_rules import RULES, SLABS_RESUMED, OptionRule, takers
+from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.region import Region
 from beamline.storage.readers.open import SourceOptions
@@ -32,8 +32,8 @@ TYPED = {
     "kernel": "gaussian", "device": "cuda", "early-stop": "", "finish": "2", "checkpoint": "c.h5", "resume": __file__,
     "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "allow-negative": "", "time": "3", "moves": "",
     "plain-splatting": "", "uncertainty": "", "truth": "t.npy", "follow": "", "earlier": "e.h5", "enough-loss": "1",
-    "enough-gain": "1", "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1", "log": "l.txt",
-    "dry-run": "", AXIS_TRIALS: "",
+    "enough-gain": "1", "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1",
+    "dry-run": "",
 }  # fmt: skip
 """A value of each option that has a rule; "" of a flag."""
 VALUES = {
@@ -43,7 +43,7 @@ VALUES = {
     "checkpoints.path": CheckpointOptions(Path("c.h5")), "checkpoints.resume": CheckpointOptions(None, Path(__file__)),
     "uncertainty": True, "truth": "t.npy", "enough.psnr_loss": Goal(None, 1.0), "unfinished": True,
     "enough.psnr_gain_per_10_views": Goal(1.0), "memory": 8_000_000_000, "cluster": "local:1", "partial": Path("p.h5"),
-    "region": Region((0, 1), (0, 1), (0, 1)),
+    "region": Region((0, 1), (0, 1), (0, 1)), "follow": FollowTiming(),
 }  # fmt: skip
 """The same in Python, by the path of the setting or of the value."""
 PAIRS = [(name, other) for name, rule in RULES.items() for other in rule.excludes if SLABS_RESUMED not in (name, other)]
@@ -52,7 +52,7 @@ LACKING = [(name, rule.needs[1]) for name, rule in RULES.items() if rule.needs i
 
 def words(name: str) -> list[str]:
     value = TYPED[name]
-    return ["--axis", "try:1:2:0.5"] if name == AXIS_TRIALS else [f"--{name}", value] if value else [f"--{name}"]
+    return [f"--{name}", value] if value else [f"--{name}"]
 
 
 def refusal(*arguments: str) -> str:
@@ -61,7 +61,7 @@ def refusal(*arguments: str) -> str:
     return done.output.partition("Error: ")[2].strip()
 
 
-def options(*names: str, also: tuple[str, ...] = ()) -> ReconOptions:
+def options(*names: str) -> ReconOptions:
     """Options of Python that say the same."""
     settings = {RULES[name].setting: VALUES[RULES[name].setting] for name in names if RULES[name].setting}
     needed = [takers(RULES[name]) for name in names if RULES[name].of_methods]
@@ -82,7 +82,7 @@ def test_each_option_is_a_value_in_python_or_of_one_call() -> None:
         for name, param in OPTIONS.items()
         if name not in RULES and renamed.get(str(param.name), str(param.name)) not in python
     }
-    of_a_call = {"config", "preset", "output", "report", "write-config", "verbose", "beside-scan", "json"}
+    of_a_call = {"config", "preset", "output", "report", "write-config", "log", "verbose", "beside-scan", "json"}
     assert alone == of_a_call | {"set", "max-residual"}
     assert {name for name in alone if not OPTIONS[name].of_one_call} == {"set", "max-residual"}
 
@@ -98,7 +98,7 @@ def test_a_rule_names_what_is_there(name: str) -> None:
         assert first in {each.name for each in fields(ReconOptions)}
         kind = {"checkpoints": CheckpointOptions, "enough": Goal}.get(first)
         assert not rest or (kind is not None and rest[0] in {each.name for each in fields(kind)})
-    assert set(rule.excludes) | ({rule.needs[0]} if rule.needs else set()) <= {*OPTIONS, AXIS_TRIALS, SLABS_RESUMED}
+    assert set(rule.excludes) | ({rule.needs[0]} if rule.needs else set()) <= {*OPTIONS, SLABS_RESUMED}
 
 
 def test_the_command_has_the_rules_of_python_and_no_others() -> None:
@@ -116,11 +116,10 @@ def test_a_contradiction_is_told_alike_everywhere(name: str, other: str, tmp_pat
         recipe.write_text("".join(f"{each}: {TYPED[each] or 'true'}\n" for each in (name, other)))
         assert refusal("--config", str(recipe)) == told
     there = [each for each in (name, other) if each in RULES and (RULES[each].value or RULES[each].setting)]
-    also = {name, other} - set(there)
-    if not there or not also <= {"follow"} or all(RULES[each].setting for each in (name, other) if each in RULES):
+    if len(there) < 2 or all(RULES[each].setting for each in there):
         return  # the command alone has them, or one method both
     with pytest.raises(ConfigError) as refused:
-        options(*there).refuse_contradictions(*also)
+        options(*there).refuse_contradictions()
     assert str(refused.value) == told
 
 
@@ -159,7 +158,7 @@ def test_defaults_of_the_command_are_those_of_python() -> None:
     context = recon.make_context("recon", ["no_scan.h5"])
     run = {each.name: each.default for each in fields(ReconOptions)}
     shared = {rule.value for rule in RULES.values()} & context.params.keys() | {"filter", "seed"}
-    assert len(shared) == 11
+    assert len(shared) == 12
     for name in shared:
         assert (context.params[name] or None) == (run[name] or None), name
     for name in ("views", "rows", "binning", "cone"):

@@ -104,5 +104,5 @@ def test_slabs_take_shifts_and_refuse_views_that_lean(tmp_path: Path) -> None:
         np.testing.assert_array_equal(whole["entry/data/data"], slabs["entry/data/data"])
         assert slabs["entry/data/data"].chunks is None  # made in slabs: one contiguous place
     code, said = run(*words, tmp_path / "none.h5", "--poses", every(tmp_path), "--memory", "3M")
-    assert code == 2 and "--poses with roll or tilt needs the whole scan in memory" in said
+    assert code == 2 and "--poses with roll, tilt or vectors needs the whole scan in memory" in said
     assert not (tmp_path / "none.h5").exists()

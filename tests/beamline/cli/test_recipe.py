@@ -15,9 +15,9 @@ import pytest
 
 from beamline.cli import log
 from beamline.cli.recipe import repeating
-from beamline.cli.segment import segment
-from beamline.cli.study import study
-from beamline.cli.tradeoff import tradeoff
+from beamline.features.particles.command import segment
+from beamline.features.trials.study_command import study
+from beamline.features.trials.tradeoff_command import tradeoff
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
@@ -85,7 +85,7 @@ def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
         ("method: [fbp, r2]\n", "expected one value"),
         ("method: r3\n", "r3"),
         ("rows: 5\n", "FIRST:END"),
-        ("method: fbp\niterations: 3\n", "--iterations is of sirt"),
+        ("method: fbp\niterations: 3\n", "--iterations is of fista-tv, os-sirt-tv, pnp-dct, mlem, osem, sirt"),
         ("just text\n", "is no recipe"),
         ("a: b: c\n", "is no YAML"),
         ("method: &a [x, x]\n" + "".join(f"b{i}: &b{i} [*a, *a, *a]\n" for i in range(9)), "expected one value"),

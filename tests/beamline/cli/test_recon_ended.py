@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.reconstruct import budget, checkpoints, job, offline
+from beamline.reconstruct import budget, checkpoints, job, pipeline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
@@ -52,7 +52,7 @@ def test_sigterm_ends_it_like_ctrl_c(folder: Path, monkeypatch: pytest.MonkeyPat
     def interrupted(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("beamline.storage.writers.recon_file._write_entry", interrupted)
+    monkeypatch.setattr("beamline.storage.writers.recon_file.write_entry", interrupted)
     before = signal.getsignal(signal.SIGTERM)
     result = beamline("recon", "scan.h5", "-m", "fbp", "--json")
     assert result.exit_code == 130
@@ -220,13 +220,13 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
 def test_ctrl_c_while_a_volume_is_measured_and_written_does_not_discard_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = offline.write_result
+    write = pipeline.write_result
 
     def interrupted(*arguments: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
         return write(*arguments)
 
-    monkeypatch.setattr(offline, "write_result", interrupted)
+    monkeypatch.setattr(pipeline, "write_result", interrupted)
     result = beamline("recon", "scan.h5", "-m", "sirt", "--iterations", "3", "--no-report")
     assert result.exit_code == 0, result.output
     assert not read_reconstruction(folder / "scan_sirt.h5").parameters.get("ended_early")

@@ -70,6 +70,34 @@ def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
     assert instrument.log[-1] == "close"  # devices that the command opened are closed
 
 
+def test_a_rehearsal_says_what_the_scan_takes_and_leaves_nothing_if_asked(tmp_path: Path) -> None:
+    small = {"devices.camera.roi": "[1100,1900,32,64]", "scan.mode": "step", "scan.angles.views": 4}
+    small |= {"scan.darks.count": 1, "scan.flats.count": 1}
+    settings = [word for key, value in small.items() for word in ("--set", f"{key}={value}")]
+    real = ["scan", str(config_folder() / "instrument.yaml"), *settings, "-o", str(tmp_path), "--no-live"]
+    done = CliRunner().invoke(main, [*real, "--rehearse", "--discard"])
+    assert done.exit_code == 0, done.output
+    planned = json.loads(CliRunner().invoke(main, [*real, "--dry-run", "--json"]).stdout)["duration"]
+    assert f"At the instrument the plan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
+    assert "discarded" in done.stdout and not list(tmp_path.iterdir())
+    assert "give --rehearse" in CliRunner().invoke(main, [*real, "--discard"]).stderr
+
+
+def test_several_scans_are_taken_in_turn_and_ctrl_c_ends_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    on(monkeypatch, FakeInstrument())
+    taxi = {"devices.stage.low_deg": -50}
+    done = scan(SIMULATED, "-o", str(tmp_path / "both"), **taxi)
+    assert done.exit_code == 0, done.output
+    assert [line.split()[:2] for line in done.stdout.splitlines()] == [["battery", "complete"]] * 2
+    assert len(list((tmp_path / "both").iterdir())) == 2
+    on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGINT, 9)))
+    stopped = scan(SIMULATED, "-o", str(tmp_path / "one"), **taxi)
+    assert stopped.exit_code == 4 and "not started" in stopped.stdout and rows(tmp_path / "one") >= 9
+    for option, said in (("--page", "is for one scan"), ("--wait", "needs a terminal")):
+        assert said in scan(SIMULATED, option, "-o", str(tmp_path / "none"), **taxi).stderr
+    assert "is for several scans" in scan("--stop-on-failure").stderr and not (tmp_path / "none").exists()
+
+
 def test_0_with_documents_each_is_valid_and_they_lead_to_the_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,7 +33,7 @@ def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: st
     assert old in GOOD
     with pytest.raises(ConfigError, match=said):
         load(write(tmp_path, GOOD.replace(old, new)))
-    with pytest.raises(ConfigError, match=r"--set .*: scan\.angles\.path: there is no file .*no\.txt"):
+    with pytest.raises(ConfigError, match=r"--set .*scan\.angles\.path:.*no\.txt"):
         load(write(tmp_path), "scan.angles={scheme: file, path: no.txt}")
 
 
@@ -60,7 +60,7 @@ def test_what_breaks_one_frame_a_pulse_is_not_for_fly_scans(option: str) -> None
 
 def test_a_level_trigger_exposes_for_the_length_of_the_pulse() -> None:
     path, level = config.config_folder() / "instrument.yaml", "devices.camera.trigger_active=level"
-    with pytest.raises(ConfigError, match=r"set devices\.stage\.pulse_width_s \(None\) to scan\.exposure_s \(0\.05\)"):
+    with pytest.raises(ConfigError, match=r"scan\.exposure_s \(0\.05\)"):
         load(path, level)
     with pytest.raises(ConfigError, match=r"pulse_width_s \(0\.001\)"):
         load(path, level, "devices.stage.pulse_width_s=0.001")

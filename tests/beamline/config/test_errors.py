@@ -24,8 +24,8 @@ FAULTS = {
     ),
     "choice": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {method: r3}"),
-        "my.yaml:2: recon.method is 'r3'; expected auto | r2 | r2-published | fbp | sirt | sart | cgls | mlem | osem | "
-        "asd-pocs | fista-tv | os-sirt-tv | pnp-dct | naf | intratomo | sax-nerf",
+        "my.yaml:2: recon.method is 'r3'; expected auto | r2 | fbp | fista-tv | os-sirt-tv | pnp-dct | "
+        "mlem | osem | sirt | sart | cgls | asd-pocs | naf | intratomo | sax-nerf | r2-published",
     ),
     "scheme": (
         ("scheme: fixed", "scheme: goldn"),
@@ -70,7 +70,7 @@ FAULTS = {
     ),
     "stage of no kind": (
         ("kind: pm16c", "kind: pm16"),
-        "my.yaml:7: devices.stage.kind is 'pm16' (did you mean pm16c?); expected pm16c | pi_gcs | zaber",
+        "my.yaml:7: devices.stage.kind is 'pm16' (did you mean pm16c?); expected epics | pi_gcs | pm16c | zaber",
     ),
     "key of another stage": (
         ("counts_per_turn", "axis: 1, counts_per_turn"),
@@ -159,7 +159,7 @@ def test_a_few_lines_that_stand_for_billions_are_refused(tmp_path: Path) -> None
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"there is no file .*absent\.yaml"):
+    with pytest.raises(ConfigError, match=r"no file.*absent\.yaml"):
         load(tmp_path / "absent.yaml")
     (tmp_path / "latin.yaml").write_bytes(b"sample: {name: \xe9}")
     with pytest.raises(ConfigError, match="UTF-8"):
@@ -196,7 +196,7 @@ def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"cannot be read: It is a folder"):
+    with pytest.raises(ConfigError, match=r"is a folder"):
         load(tmp_path)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from beamline.core.events import KINDS, LONGEST, event_in, event_of, whole_lines
-from beamline.epics.ioc import RunValues, StampedValues
+from beamline.features.epics.ioc import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
 
@@ -26,7 +26,7 @@ def test_lines_of_nearly_every_kind_were_recorded() -> None:
 
 
 def test_a_line_of_no_kind_is_refused_with_its_values() -> None:
-    with pytest.raises(ValueError, match=r"no kind of event has the values .*'pid': 7"):
+    with pytest.raises(ValueError, match=r"the values.*'pid': 7"):
         event_of({"event": "at work", "pid": 7})
     with pytest.raises(ValueError, match="no kind"):
         event_of({"event": "warning"})

@@ -57,7 +57,7 @@ def test_a_peak_can_be_reset() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has another call")
 def test_the_status_file_of_linux(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(module, "_STATUS", tmp_path / "status")
+    monkeypatch.setattr(module, "STATUS", tmp_path / "status")
     assert peak_memory() is None
     write(tmp_path / "status", "Name:\tpython\n\nVmPeak:\t  999 kB\nVmHWM:\t  1234 kB\n")
     assert peak_memory() == 1234 * 1024
@@ -78,8 +78,8 @@ def write(path: Path, text: str) -> Path:
 def pretend(monkeypatch: pytest.MonkeyPatch, folder: Path, own: str = "0::/user/session\n") -> Path:
     """A computer with 8 MB available, whose control groups a test fills in."""
     monkeypatch.setattr(module.psutil, "virtual_memory", lambda: SimpleNamespace(available=8192 * KB))
-    monkeypatch.setattr(module, "_OWN_CGROUP", write(folder / "cgroup", own))
-    monkeypatch.setattr(module, "_CGROUPS", folder / "groups")
+    monkeypatch.setattr(module, "OWN_CGROUP", write(folder / "cgroup", own))
+    monkeypatch.setattr(module, "CGROUPS", folder / "groups")
     return folder / "groups"
 
 

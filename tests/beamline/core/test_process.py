@@ -100,7 +100,7 @@ def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hur
 def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silence_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_FROZEN", 1.5)  # so long may a busy machine give it no time
+    monkeypatch.setattr(module, "FROZEN_AFTER", 1.5)  # so long may a busy machine give it no time
     frozen, begin = _Child(tmp_path, DELIVERS), time.monotonic()
     while not frozen.begun():
         time.sleep(0.01)

@@ -11,10 +11,10 @@ import pytest
 
 from beamline.config.load import config_folder, load, resolved_yaml
 from beamline.core.process import ChildProcess, Ending, with_our_path
-from beamline.reconstruct.batch import COMMAND
+from beamline.features.batch.batch import COMMAND
+from beamline.features.trials.launch import command as trial
 from beamline.scan.run_folder import CONFIG
 from beamline.scan.watchdog import watched
-from beamline.trials.launch import command as trial
 
 OURS = ("beamline", "drivers", "recon", "simulators")
 TAKEN = {*sys.stdlib_module_names} - {*sys.builtin_module_names} | {*OURS, "numpy", "h5py", "serial", "yaml"}
@@ -81,7 +81,7 @@ def test_the_path_of_a_child_is_without_the_working_folder(monkeypatch: pytest.M
 @pytest.mark.slow
 def test_workers_on_this_machine_start(executed: Callable[[], list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    from beamline.reconstruct.cluster import connected
+    from beamline.features.cluster.cluster import connected
 
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     with connected("local:1") as cluster:

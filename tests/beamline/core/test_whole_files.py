@@ -21,7 +21,7 @@ def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: 
         raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(files.os, "fsync", fsync)
-    with pytest.raises(DataError, match=r"page.html could not be written .Input/output error.*nothing is left of it"):
+    with pytest.raises(DataError, match=r".Input/output.*left of it"):
         write_whole(tmp_path / "page.html", "a page")
     with pytest.raises(DataError, match="Input/output error"), whole_file(tmp_path / "folder") as partial:
         (partial / "below").mkdir(parents=True)
@@ -33,7 +33,7 @@ def test_what_is_read_back_is_compared(tmp_path: Path, monkeypatch: pytest.Monke
     path = tmp_path / "table.csv"
     write_whole(path, "old")
     monkeypatch.setattr(files, "bring_to_disk", lambda partial: partial.write_bytes(b"nex"))
-    with pytest.raises(DataError, match=r"not what was written.*what was there is untouched"):
+    with pytest.raises(DataError, match=r"what was written.*there is untouched"):
         write_whole(path, "new", replace=True)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
@@ -69,7 +69,7 @@ def test_a_link_to_what_is_not_there_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("away/out")
     for path in (tmp_path / "link", tmp_path / "link" / "below" / "out.h5"):
         for replace in (False, True):
-            with pytest.raises(DataError, match=r"link is a link to away/out, which is not there.*Nothing was written"):
+            with pytest.raises(DataError, match=r"away/out.*Nothing was written"):
                 write_whole(path, "new", replace=replace)
     with pytest.raises(DataError, match="is a link to"), whole_file(tmp_path / "late") as partial:
         partial.write_text("new")

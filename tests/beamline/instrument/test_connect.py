@@ -18,9 +18,9 @@ from beamline.core.stop import ScanAborted
 from beamline.instrument import connect as devices
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import TriggerSource
-from drivers.dcam.options import DcamOptions
 from drivers.frame_memory import FrameMemory
 from drivers.manual import ManualSampleMover, ManualShutter
+from drivers.orca_quest import DcamOptions
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable
 
@@ -98,7 +98,7 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     instrument = devices.connect(shipped("instrument", "devices.camera.index=1"), ask=asked.append)
     assert made[0][0] == (None, 1)
-    assert made[0][1]["options"] == DcamOptions(ring_bytes=1_000_000_000)
+    assert made[0][1]["options"] == DcamOptions()
     assert isinstance(instrument.devices.shutter, ManualShutter)
     assert isinstance(instrument.devices.sample, ManualSampleMover)
     assert instrument.truth is None
@@ -106,27 +106,6 @@ def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     assert asked == ["Open the beam shutter."]
     instrument.close()
     assert stage.closed == 2
-
-
-def test_a_beam_monitor_is_part_of_the_bench(tmp_path: Path) -> None:
-    with devices.connect(small()) as instrument:
-        assert instrument.beam_monitor is None
-    transcript = tmp_path / "electrometer.txt"
-    chosen = f"{{kind: electrometer, port: 'sim://electrometer', scale: 1e9, unit: nA, transcript: '{transcript}'}}"
-    with devices.connect(small(f"devices.beam_monitor={chosen}")) as instrument:
-        assert instrument.beam_monitor is not None
-        reading = instrument.beam_monitor.reading()
-        assert (reading.value, reading.unit) == (pytest.approx(1.0), "nA")
-        assert abs(reading.time - instrument.clock.now()) < 1
-    with pytest.raises(DeviceError):
-        instrument.beam_monitor.reading()
-    assert b"READ?" in transcript.read_bytes()
-    page = tmp_path / "ring.txt"
-    page.write_text("I = 99.5 mA", encoding="utf-8")
-    chosen = f"{{kind: ring_current, url: '{page.as_uri()}', pattern: 'I = ([0-9.]+) mA'}}"
-    with devices.connect(small(f"devices.beam_monitor={chosen}")) as instrument:
-        assert instrument.beam_monitor is not None
-        assert instrument.beam_monitor.reading().value == 99.5
 
 
 def test_a_port_that_is_not_there() -> None:
@@ -179,7 +158,7 @@ def test_every_camera_option_reaches_the_driver(
     for field in dataclasses.fields(DcamOptions):
         value = getattr(camera.options, field.name)
         assert value != getattr(default, field.name), field.name
-        key = {"trigger_delay": "trigger_delay_s", "ring_bytes": "ring_mb"}.get(field.name, field.name)
+        key = {"trigger_delay": "trigger_delay_s", "ring": "ring_mb"}.get(field.name, field.name)
         assert value == said[key] * (1_000_000 if key == "ring_mb" else 1)
     assert waited == [90]
 

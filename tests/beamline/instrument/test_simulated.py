@@ -54,11 +54,9 @@ def test_every_stage_gives_the_planned_angles(stage: str, angles: str) -> None:
 
 @pytest.mark.parametrize("output", ["kind: pi_gcs, trigger_line", "kind: zaber, output"])
 def test_an_output_that_a_simulated_controller_lacks_is_refused_in_words(output: str) -> None:
-    kind, key = output.removeprefix("kind: ").split(", ")
+    kind, _ = output.removeprefix("kind: ").split(", ")
     settings = small(f"devices.stage={{{output}: 9, port: 'sim://{kind}', {COMMON}}}")
-    with pytest.raises(
-        ConfigError, match=rf"devices\.stage\.{key}: the simulated controller has no digital output 9; it has 1 to 4"
-    ):
+    with pytest.raises(ConfigError, match=r"has 1 to 4"):
         devices.connect(settings)
 
 

@@ -51,7 +51,7 @@ def test_every_set_of_flags_has_its_own_bits(found: list[tuple[str, Level]]) -> 
 def test_a_check_with_a_bit_or_a_name_that_is_taken_is_refused(change: dict[str, Any]) -> None:
     bands = next(check for check in CHECKS if check.name == "bands")
     other = type("Other", (type(bands),), {"name": "other", "bit": 47} | change)()
-    with pytest.raises(ValueError, match=r"a bit \(0 \.\.\. 15, 32 \.\.\. 47\) of its own, got .*bands 3"):
+    with pytest.raises(ValueError, match=r"bit \(0 \.\.\. 15, 32 \.\.\. 47\).*bands 3"):
         _distinct(*CHECKS, other)
 
 

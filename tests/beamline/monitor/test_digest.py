@@ -179,7 +179,7 @@ def test_one_changed_pixel_changes_the_checksum(rng: np.random.Generator) -> Non
 
 @pytest.mark.parametrize("bad", [np.zeros((2, 2, 2)), np.zeros((0, 4)), np.zeros((2, 2), complex), np.zeros(4)])
 def test_what_is_no_frame_is_refused(bad: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r"non-empty real \[row, col\]"):
+    with pytest.raises(ValueError, match=r"real \[row, col\]"):
         digest(bad)
     with pytest.raises(ValueError, match="at least 1"):
         digest(np.zeros((2, 2)), preview_bin=0)

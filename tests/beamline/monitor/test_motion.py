@@ -10,7 +10,7 @@ import pytest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
-from tests.beamline.monitor.test_ghost import fog
+from tests.beamline.monitor.foreign.test_ghost import fog
 
 
 def only(scan: Blobs) -> list[Flag]:

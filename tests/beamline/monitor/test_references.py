@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.digest import digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
+from beamline.storage.rules.references import look_at
 from drivers.base.frame import FrameKind
 
 SHAPE = (64, 80)
@@ -107,6 +108,29 @@ def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], 
     assert said in fault.message
     assert fault.score > fault.limit or what == "no_beam"
     assert found[1].described().startswith("The flats 10-14: ")
+
+
+@pytest.mark.parametrize("photons", [PHOTONS, 30.0])
+def test_flats_whose_counts_end_below_their_type_are_saturated(photons: float) -> None:
+    end = int(OFFSET + GAIN * photons)  # half of the pixels have more, but for the hot ones
+    images = frames(5, photons, 2)
+    cut, whole = (
+        [look_at(image.astype(np.uint16), 10 + i) for i, image in enumerate(each)]
+        for each in ([np.minimum(image, end) for image in images], images)
+    )
+    clean = [replace(frame, kind=FrameKind.DARK) for frame in darks()]
+    for seen, expected in ((whole, []), (cut, ["saturated"]), (cut[:1], [])):
+        group_of = [replace(frame, kind=FrameKind.FLAT) for frame in seen]
+        found = judge([clean, group_of])
+        assert faults(found) == [[], expected]
+        assert not expected or f"hold {end}, the largest count" in found[1].faults[0].message
+    struck = [np.minimum(image, end) for image in images]
+    for n, image in enumerate(struck):  # a hot pixel, and another one that a zinger hits
+        image[3, 5], image[10 + n, 7] = FULL - 5000, FULL - 9000 + n
+    hit = [replace(look_at(image.astype(np.uint16), n), kind=FrameKind.FLAT) for n, image in enumerate(struck)]
+    assert faults(judge([clean, hit])) == [[], ["saturated"]]
+    still = [replace(frame, kind=FrameKind.FLAT, row=i) for i, frame in enumerate([cut[0]] * 3)]
+    assert faults(judge([clean, still]))[1] == []  # computed without noise: a plateau is no end of counts
 
 
 @pytest.mark.parametrize("share", [0.25, 0.6])

@@ -51,3 +51,12 @@ def test_pixels_that_are_hot_without_light_do_not_count(fake: Any) -> None:
 
 def test_saturated_flats_are_flagged(fake: Any) -> None:
     assert len(only(fake.flags(fake.darks() + burn(fake.flats(2), 50)))) == 2
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_views_after_saturated_ones_are_not_taken_for_dim(fake: Any, share: float) -> None:
+    frames = fake.references() + fake.views(24)
+    row = len(frames) - 12
+    for frame in frames[row : row + 4]:
+        frame.counts[: int(share * len(frame.counts))] = SATURATION
+    assert {flag.frame for flag in fake.flags(frames) if flag.level is Level.ALARM} == set(range(row, row + 4))

@@ -120,7 +120,7 @@ IN_KERNELS = {"_clipped", "_product", "_smooth", "_weigh", "_folded", "_place", 
 
 @pytest.mark.parametrize("step", [float("nan"), 0.002])  # rad: a scan's may be that of the toy, or another
 def test_a_rehearsal_runs_every_kernel_that_frames_of_counts_need(monkeypatch: pytest.MonkeyPatch, step: float) -> None:
-    monkeypatch.setattr(watch, "_REHEARSED", set())
+    monkeypatch.setattr(watch, "REHEARSED", set())
     monitor = start(ScanContext(65535, 2048**2, period=0.1, step=step))
     kernels = {
         name: kernel
@@ -139,7 +139,7 @@ def test_a_rehearsal_runs_every_kernel_that_frames_of_counts_need(monkeypatch: p
 def test_the_next_scan_of_the_process_by_the_same_checks_waits_for_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, looks = start(ScanContext(65535, 2048**2, period=0.1)), list[int]()
     look = watch.look
-    monkeypatch.setattr(watch, "_REHEARSED", set())
+    monkeypatch.setattr(watch, "REHEARSED", set())
     monkeypatch.setattr(watch, "look", lambda *args: (looks.append(1), look(*args))[1])
     rehearse(monitor)
     first = len(looks)

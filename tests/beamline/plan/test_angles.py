@@ -96,7 +96,7 @@ def test_interlaced_gaps_halve(power: int, done: int) -> None:
 
 @pytest.mark.parametrize(("views", "passes"), [(10, 3), (10, 10), (10, 0), (3, 2)])
 def test_interlaced_names_the_legal_passes(views: int, passes: int) -> None:
-    with pytest.raises(ValueError, match=f"{views} views cannot be taken in {passes} equal passes.*legal passes: 1"):
+    with pytest.raises(ValueError, match=f"{views} views.*legal passes: 1"):
         angles.interlaced(views, passes)
 
 

@@ -83,8 +83,9 @@ def test_a_step_scan_worked_by_hand() -> None:
     # Each view at its nearest whole count, in the order asked for.
     np.testing.assert_allclose(views.angles / DEG, [0, 10, 10, -1], atol=1e-12)
     assert (timeline.step_counts, timeline.blur_px, timeline.skew_px) == (0, 0.0, 0.0)
-    # Moves of 0, 10, 0 and 11 deg (triangles: below 30**2 / 60 = 15 deg), 0.1 s to settle, 0.0506 s to expose and read.
-    times = [0.1506, 2 * math.sqrt(10 / 60) + 0.1506, 0.1506, 2 * math.sqrt(11 / 60) + 0.1506]
+    # Moves of 0, 10 and 11 deg (triangles: below 30**2 / 60 = 15 deg), 0.1 s to settle, 0.0506 s to expose and read.
+    # The second frame at 10 deg needs neither move nor settling, only the period of 0.1 s.
+    times = [0.1506, 2 * math.sqrt(10 / 60) + 0.1506, 0.1, 2 * math.sqrt(11 / 60) + 0.1506]
     assert block_seconds(views, STAGE, CAMERA, plan.settle) == pytest.approx(sum(times))
     slow = replace(plan, period=5.0)
     assert block_seconds(worked(slow).blocks[2], STAGE, CAMERA, plan.settle) == pytest.approx(0.1 + 3 * 5.0 + 0.0506)

@@ -136,7 +136,7 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     assert errors[1] < 0.3 * errors[0]
     assert "components of their changes" in correction.done["flats"].sentence
     few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
-    with pytest.raises(ConfigError, match="--flat-fields dynamic: array: dynamic flats need at least 4 flats, got 3"):
+    with pytest.raises(ConfigError, match="--flat-fields"):
         ScanCorrection(few, Selection(steps=(Flats("dynamic"),)), lambda _: None)  # type: ignore[arg-type]
 
 
@@ -150,7 +150,7 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     )
     source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
     none = Selection(steps=(Air("none"),))
-    with pytest.raises(ConfigError, match="array has no ring current"):
+    with pytest.raises(ConfigError, match="no ring current"):
         ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
     source.currents = current
     off = []
@@ -160,5 +160,5 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     assert off[0] > 0.5 and off[1] < 0.01
     assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
-    with pytest.raises(ConfigError, match="no ring current for some views or flats"):
+    with pytest.raises(ConfigError, match="views or flats"):
         ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]

@@ -47,6 +47,15 @@ def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> Non
     assert warnings == []
 
 
+def test_frames_of_a_view_that_stand_far_apart_are_named(tmp_path: Path) -> None:
+    """40 columns, views 4 degrees apart: two of them blur the edge by 1.4 columns, six by 7."""
+    path, selection = write_exchange(tmp_path / "scan.h5", SCAN), Selection(axis_col=SCAN.axis_col, steps=PLAIN)
+    for n, expected in ((2, []), (6, ["averages frames that are up to 20 degrees apart", "by 7 pixels"])):
+        _, warnings = _prepare(path, selection, frames_per_view=n)
+        told = [warning for warning in warnings if "--frames-per-view" in warning]
+        assert len(told) == bool(expected) and all(words in told[0] for words in expected)
+
+
 @pytest.mark.parametrize(("rows", "binning", "shape"), [((1, 4), 1, (3, 40)), (None, 2, (2, 20)), ((0, 4), 3, (1, 13))])
 def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: int, shape: tuple[int, int]) -> None:
     path = write_exchange(tmp_path / "scan.h5", replace(SCAN, pixel_size_mm=0.5))
@@ -197,7 +206,7 @@ def test_bad_scans_are_refused_by_name(tmp_path: Path, case: str) -> None:
 
 def test_unknown_quantity_names_the_option(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data_white": None, "data_dark": None})
-    with pytest.raises(DataError, match=r"--quantity counts, --quantity transmission or --quantity line-integrals"):
+    with pytest.raises(DataError, match=r"--quantity counts, --quantity"):
         _prepare(path, Selection())
 
 

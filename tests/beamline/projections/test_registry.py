@@ -7,8 +7,8 @@ import pytest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.counts import CountModel
 from beamline.projections.corrections.flags import Flags
-from beamline.projections.corrections.phase import Phase
-from beamline.projections.corrections.rings import Rings
+from beamline.projections.corrections.phase.phase import Phase
+from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
 from beamline.projections.selection import Selection
@@ -28,7 +28,7 @@ def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
     assert len(values) == len(options)
     assert steps_of(values) == tuple(step() for step in registered())
     assert not any(step.needs_finished for step in steps_of(values))
-    with pytest.raises(ValueError, match="--gain is for counted photons"):
+    with pytest.raises(ValueError, match="--gain"):
         steps_of(values | {"noise": "log", "gain": 2.0})
 
 

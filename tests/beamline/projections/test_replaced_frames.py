@@ -114,7 +114,7 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """They look like one view, and other views outshine them in places."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match=r"they look like the view in frame 2.*sample was in the beam"):
+    with pytest.raises(DataError, match=r"frame 2.*in the beam"):
         decibels(blocks.source())
 
 
@@ -142,7 +142,7 @@ def test_darks_and_flats_swapped_are_refused() -> None:
     blocks = Blocks(1, 3)
     dark, flat = blocks.of(DARK)[0], blocks.of(FLAT)[0]
     dark[:], flat[:] = flat.copy(), dark.copy()
-    with pytest.raises(DataError, match="The flats 3-5: there is no beam in them"):
+    with pytest.raises(DataError, match="flats 3-5:"):
         decibels(blocks.source())
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.model import ModelCheck
+from beamline.monitor.foreign.model import ModelCheck
 from beamline.projections.rendered import rendered
 from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource

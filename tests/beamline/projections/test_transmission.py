@@ -11,11 +11,11 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import validate
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders()
@@ -49,7 +49,7 @@ def test_whole_numbers_have_a_flat_of_their_own(tmp_path: Path) -> None:
     path, shape = stack(tmp_path / "t.tif", 6e4 * np.exp(-LINES), np.uint16), (1, *SCAN.shape)
     flats = np.full(shape, 60000, np.uint16)
     np.testing.assert_allclose(lines(path, darks=np.zeros(shape, np.uint16), flats=flats), LINES, atol=1e-4)
-    with pytest.raises(DataError, match="uint16 pixels; transmission is a real number from 0 to 1"):
+    with pytest.raises(DataError, match="from 0 to 1"):
         lines(path, quantity="transmission")
 
 
@@ -57,7 +57,7 @@ def test_whole_numbers_have_a_flat_of_their_own(tmp_path: Path) -> None:
 def test_it_is_never_taken_as_line_integrals(tmp_path: Path, beam: float) -> None:
     path = stack(tmp_path / "t.tif", beam * np.exp(-LINES))
     for quantity in ("line_integrals", None):
-        with pytest.raises(DataError, match=r"fall where the sample is.* Say --quantity transmission"):
+        with pytest.raises(DataError, match=r"the sample is.* Say --quantity transmission"):
             lines(path, quantity=quantity)
     assert "Say --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
 
@@ -82,13 +82,13 @@ def test_line_integrals_are_never_taken_as_transmission(tmp_path: Path) -> None:
     path, shape = stack(tmp_path / "p.tif", LINES), (1, *SCAN.shape)
     np.testing.assert_array_equal(lines(path, quantity="line_integrals"), LINES.astype(np.float32))
     for facts in ({"quantity": "transmission"}, {"darks": np.zeros(shape), "flats": np.ones(shape)}):
-        with pytest.raises(DataError, match=r"0 at the edges.* Say --quantity line-integrals"):
+        with pytest.raises(DataError, match=r"0 at the edges.*--quantity"):
             lines(path, **facts)
 
 
 def test_references_beside_it_are_refused(tmp_path: Path) -> None:
     path = stack(tmp_path / "t.tif", np.exp(-LINES))
-    with pytest.raises(DataError, match="leave out --darks and --flats"):
+    with pytest.raises(DataError, match="--darks and --flats"):
         open_scan(SourceOptions(path, quantity="transmission", flats=np.ones((1, *SCAN.shape))))
 
 

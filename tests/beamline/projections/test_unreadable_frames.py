@@ -10,14 +10,14 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.storage.ingest import ingest
 from beamline.storage.readers.base import read_known
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.rules.validate import validate
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 

@@ -13,37 +13,22 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct.follow import FollowTiming
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame
 from recon.splatting.r2 import R2
 from tests.beamline.scans import TwoCylinders
+from tests.clock import SteppedClock
 
 EPOCH = 1.8e9
 TICK = 0.02  # s that pass with each look at the clock
 
 
-class ScanClock:
-    """Time passes when it is looked at; what is due by then happens."""
-
+class ScanClock(SteppedClock):
     def __init__(self) -> None:
-        self.time = EPOCH
-        self.due: list[tuple[float, Callable[[], None]]] = []
-
-    def now(self) -> float:
-        self._pass(TICK)
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self._pass(seconds)
-
-    def _pass(self, seconds: float) -> None:
-        self.time += seconds
-        while self.due and self.due[0][0] <= self.time:
-            self.due.pop(0)[1]()
+        super().__init__(EPOCH, TICK)
 
 
 class StandingClock:
@@ -106,6 +91,7 @@ def options(tmp_path: Path, **changes: object) -> ReconOptions:
         target=OutputPaths(output, None),
         selection=Selection(axis_col=SCAN.axis_col),
         method=FIT,
+        follow=RHYTHM,
         command="beamline recon scan.h5 --follow",
     )
     return replace(usual, **changes)  # type: ignore[arg-type]

@@ -22,9 +22,9 @@ from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
-from beamline.reconstruct.follow import follow
 from beamline.reconstruct.live_fit import FollowState, ScanFollower
 from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame
@@ -57,7 +57,8 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
-    metrics = follow(options(tmp_path, target=target, method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM)
+    wanted = options(tmp_path, target=target, method=replace(FIT, seconds=4.0))
+    metrics = reconstruct_file(wanted, events.append, clock).metrics
 
     names = [event.event for event in events]
     assert names[0] == "state"
@@ -71,7 +72,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     assert drawn[0]["n_views"] == 8 and drawn[-1]["n_views"] == SCAN.angles.size
     assert names.index("slices") < names.index("snapshot")
     assert names[-1] == "done"
-    steps = [event.data for event in events if event.event == "progress" and not event.data.get("unit")]
+    steps = [event.data for event in events if event.data.get("stage") == "recon" and not event.data.get("unit")]
     views = [step["n_views"] for step in steps]  # the sweeps of the finish follow
     assert views == sorted(views)
     assert views[0] < 30  # it began before the scan had ended
@@ -99,7 +100,7 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     def at_the_end() -> Iterator[Callable[[], bool]]:
         yield lambda: any(event.data.get("state") == "finishing" for event in events)
 
-    follow(options(tmp_path, method=replace(FIT, seconds=1e5)), events.append, clock, RHYTHM, at_the_end)
+    reconstruct_file(options(tmp_path, method=replace(FIT, seconds=1e5)), events.append, clock, at_the_end)
     assert events[-1].event == "done"
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert parameters["ended_early"] and parameters["n_views"] == 30
@@ -119,10 +120,10 @@ def test_a_stop_while_the_scan_runs_delivers_the_views_so_far_if_they_make_a_vol
     wanted = options(tmp_path, method=replace(FIT, seconds=1e5))
     if seconds < 2:  # seven views
         with pytest.raises(KeyboardInterrupt):
-            follow(wanted, events.append, clock, RHYTHM, soon)
+            reconstruct_file(wanted, events.append, clock, soon)
         assert not wanted.target.output.exists()
     else:
-        follow(wanted, events.append, clock, RHYTHM, soon)
+        reconstruct_file(wanted, events.append, clock, soon)
         parameters = read_reconstruction(tmp_path / "recon.h5").parameters
         n_views = int(parameters["n_views"])
         assert parameters["ended_early"] and 16 <= n_views < 30
@@ -137,13 +138,13 @@ def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     close(clock)
-    monkeypatch.setattr(module, "_BATCH", 8)
+    monkeypatch.setattr(module, "BATCH_VIEWS", 8)
 
     @contextmanager
     def at_once() -> Iterator[Callable[[], bool]]:
         yield lambda: True
 
-    follow(options(tmp_path), events.append, clock, RHYTHM, at_once)
+    reconstruct_file(options(tmp_path), events.append, clock, at_once)
     assert events[-1].event == "done"
     n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
     assert 16 <= n_views < 30
@@ -154,14 +155,14 @@ def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
 def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), pause=5 * RHYTHM.patience)
-    follow(options(tmp_path), lambda event: None, clock, RHYTHM)
+    reconstruct_file(options(tmp_path), lambda event: None, clock)
     assert read_reconstruction(tmp_path / "recon.h5").parameters["n_views"] == 30
 
 
 def test_one_of_so_many_views_feeds_the_volume(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms={12})
-    follow(options(tmp_path, selection=Selection("every:2", axis_col=SCAN.axis_col)), [].append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=Selection("every:2", axis_col=SCAN.axis_col)), [].append, clock)
     n_views = int(read_reconstruction(tmp_path / "recon.h5").parameters["n_views"])
     assert n_views in (14, 15)  # of 30, one of them or of the others with an alarm
 
@@ -181,7 +182,7 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
             unlearnt.append(event.data["unlearnt"])
             seen.append((event.data["n_views"], psnr(SCAN.truth(record.volume.grid), record.volume.data)))
 
-    follow(options(tmp_path), look, clock, RHYTHM)
+    reconstruct_file(options(tmp_path), look, clock)
     assert len(seen) >= 3
     assert seen[-1][0] > seen[0][0]
     assert max(quality for _, quality in seen) > 18
@@ -216,7 +217,7 @@ def test_the_report_has_the_facts_of_the_closed_file(tmp_path: Path) -> None:
             writer.join(60)
 
     target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
-    follow(options(tmp_path, target=target), look, ScanClock(), RHYTHM)
+    reconstruct_file(options(tmp_path, target=target), look, ScanClock())
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"end_time</th><td>{datetime.fromtimestamp(EPOCH, UTC).isoformat(timespec='milliseconds')}</td>" in page
 
@@ -231,11 +232,11 @@ def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         asked.append((len(data), planned.n_views))
         return [4.0 / len(data)] * n
 
-    monkeypatch.setattr("beamline.reconstruct.enough.predicted_gains", predicted)
+    monkeypatch.setattr("beamline.reconstruct.followed_views.predicted_gains", predicted)
     clock, events = ScanClock(), list[Event]()
     plan = json.dumps({"angles_deg": np.degrees(golden).tolist()})
     schedule(clock, tmp_path / "scan.h5", frames_of(scan), plan=plan)
-    follow(options(tmp_path, enough=Goal(psnr_loss=0.2)), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, enough=Goal(psnr_loss=0.2)), events.append, clock)
     (enough,) = [event.data for event in events if event.event == "enough"]
     assert 24 < enough["n_views"] < 60 == enough["planned"]
     assert enough["high"] <= 0.2 and enough["low"] <= enough["mean"] <= enough["high"]
@@ -246,7 +247,7 @@ def test_where_the_plan_is_not_known_no_views_are_enough(tmp_path: Path) -> None
     clock, events = ScanClock(), list[Event]()
     scan = replace(INTERLACED, angles=np.radians(np.arange(0, 180, 3.0))[np.argsort(np.arange(60) * 0.618 % 1)])
     schedule(clock, tmp_path / "scan.h5", frames_of(scan))
-    follow(options(tmp_path, enough=Goal(psnr_loss=9.0)), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, enough=Goal(psnr_loss=9.0)), events.append, clock)
     assert sum("does not say which views are planned" in str(e.data.get("message")) for e in events) == 1
     assert "enough" not in [event.event for event in events]
 
@@ -291,7 +292,7 @@ def test_scans_that_make_no_volume(
     clock = ScanClock()
     scan(clock, tmp_path / "scan.h5")
     with pytest.raises(DataError, match=said):
-        follow(options(tmp_path), lambda event: None, clock, RHYTHM)
+        reconstruct_file(options(tmp_path), lambda event: None, clock)
     assert {p.name for p in tmp_path.iterdir()} == left
     close(clock)
 
@@ -309,14 +310,14 @@ def test_what_cannot_be_followed_is_refused_at_once(
     tmp_path: Path, changes: dict[str, object], error: type[BeamlineError]
 ) -> None:
     with pytest.raises(error):
-        follow(options(tmp_path, **changes), lambda event: None, ScanClock(), RHYTHM)
+        reconstruct_file(options(tmp_path, **changes), lambda event: None, ScanClock())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_existing_result_stays(tmp_path: Path) -> None:
     (tmp_path / "recon.h5").write_text("precious")
     with pytest.raises(DataError, match="never overwritten"):
-        follow(options(tmp_path), lambda event: None, ScanClock(), RHYTHM)
+        reconstruct_file(options(tmp_path), lambda event: None, ScanClock())
     assert (tmp_path / "recon.h5").read_text() == "precious"
 
 
@@ -331,7 +332,7 @@ def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(snapshots, "write_reconstruction", write)
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    follow(options(tmp_path), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path), events.append, clock)
     assert any("snapshot was left out" in str(e.data.get("message")) for e in events)
     assert "snapshot" not in [e.event for e in events]
     assert h5py.is_hdf5(tmp_path / "recon.h5")
@@ -341,7 +342,7 @@ def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(replace(INTERLACED, shape=(4, 40))))
     selection = Selection(rows=(1, 3), binning=2, axis_col=SCAN.axis_col)
-    follow(options(tmp_path, selection=selection), lambda event: None, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=selection), lambda event: None, clock)
     volume: Volume = read_reconstruction(tmp_path / "recon.h5").volume
     assert volume.grid.shape == (1, 20, 20)
     assert volume.grid.voxel_size == pytest.approx(1.0)

@@ -10,11 +10,11 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.projections.selection import Selection
-from beamline.reconstruct import axis_search
-from beamline.reconstruct.follow import follow
+from beamline.reconstruct import followed_views
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.prep.align import AxisEstimate
-from tests.beamline.reconstruct.growing_scan import FIT, INTERLACED, RHYTHM, SCAN, ScanClock, options, schedule
+from tests.beamline.reconstruct.growing_scan import FIT, INTERLACED, SCAN, ScanClock, options, schedule
 from tests.beamline.scans import frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -25,14 +25,14 @@ def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -
     schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), begin=0.0, period=0.0, axis_col=20.25)
     clock.sleep(1.0)
     events: list[Event] = []
-    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
     assert events[-1].data["axis_col"] == 20.25
 
 
 def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
     started = [event.data for event in events if event.event == "recon_started"]
     assert started[0]["n_views"] < 30
     assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
@@ -45,12 +45,12 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
         value = 18.0 if frames.size < 20 else 20.7
         return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
 
-    monkeypatch.setattr(axis_search, "locate_axis", locate)
+    monkeypatch.setattr(followed_views, "locate_axis", locate)
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    metrics = follow(
-        options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM
-    )
+    metrics = reconstruct_file(
+        options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0)), events.append, clock
+    ).metrics
     assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
     assert events[-1].data["axis_col"] == 20.7
     assert [e.data["again"] for e in events if e.event == "recon_started"] == [False, True]
@@ -68,7 +68,7 @@ def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
     monkeypatch.setattr("beamline.projections.axis.axis_by_views", lambda data, geometry, lit: unclear)
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=Selection()), events.append, clock)
     (started,) = [event.data for event in events if event.event == "recon_started"]
     assert started["n_views"] == 30
     assert any(e.event == "warning" and "not a clear optimum" in e.data["message"] for e in events)

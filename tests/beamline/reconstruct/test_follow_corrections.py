@@ -17,11 +17,12 @@ from beamline.projections.corrections.flags import Flags
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
-from beamline.reconstruct import follow as follow_module
-from beamline.reconstruct.follow import follow
+from beamline.reconstruct import pipeline
 from beamline.reconstruct.live_fit import ScanFollower
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame, FrameKind
@@ -51,7 +52,7 @@ def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: b
     clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
-    follow(options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
     assert parameters["views_left_out"] == 5 * use_flags
@@ -67,7 +68,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     frames[12] = replace(frames[12], counts=frames[12].counts // 40)
     schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
     selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
-    metrics = follow(options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    metrics = reconstruct_file(options(tmp_path, selection=selection), events.append, clock).metrics
     record = read_reconstruction(tmp_path / "recon.h5")
     assert set(record.parameters["view_frames"]) == set(range(4, 35)) - {12}  # type: ignore[arg-type]
     assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20 and metrics["residual"] < 0.1
@@ -81,7 +82,7 @@ def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, lat
     frames = frames_of(INTERLACED)
     order = [frame for frame in frames if frame.kind is not late] + [frame for frame in frames if frame.kind is late]
     schedule(clock, tmp_path / "scan.h5", [replace(frame, index=i) for i, frame in enumerate(order)])
-    metrics = follow(options(tmp_path), events.append, clock, RHYTHM)
+    metrics = reconstruct_file(options(tmp_path), events.append, clock).metrics
     waiting = [event.data["message"] for event in events if event.event == "state"]
     assert sum("when the scan has ended" in message for message in waiting) == 1
     assert metrics["residual"] < 0.1
@@ -98,7 +99,7 @@ def test_what_stands_in_the_beam_of_all_views_counts_as_not_measured(tmp_path: P
             frame.counts[:, :10] = DARK
     schedule(clock, tmp_path / "scan.h5", frames)
     selection = Selection(axis_col=SCAN.axis_col)
-    follow(options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
     said = [str(event.data.get("message")) for event in events]
     assert sum("stands in the beam of all views" in each for each in said) == 1
     assert any("of the detector got no beam, or is saturated" in each for each in said)
@@ -115,17 +116,13 @@ def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
     return [replace(frame, index=i) for i, frame in enumerate([*frames, *after])]
 
 
-_EVERY_PAIR = {
-    ("auto", None, 0.0), ("auto", 1.3, 2.0),
-    ("none", None, 2.0), ("none", 1.3, 0.0),
-    ("3,3", None, 0.0), ("3,3", 1.3, 2.0),
-}  # fmt: skip
+_EACH = {("auto", 1.3, 2.0), ("none", None, 2.0), ("3,3", 1.3, 0.0)}
 
 
 @pytest.mark.parametrize(
     ("air", "gain", "pause"),
     [
-        pytest.param(*three, marks=() if three in _EVERY_PAIR else pytest.mark.slow)
+        pytest.param(*three, marks=() if three in _EACH else pytest.mark.slow)
         for three in product(["auto", "none", "3,3"], [None, 1.3], [0.0, 2.0])
     ],
 )
@@ -136,23 +133,23 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     fits: list[StreamingFit] = []
     finish = StreamingFit.finish
     judged: list[PreparedProjections] = []
-    write = follow_module.write_result
+    write = pipeline.write_result
 
     def finish_and_keep(self: StreamingFit, *rest: Any) -> Progress:
         fits.append(self)
         return finish(self, *rest)
 
-    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
         judged.append(prepared)
         return write(outcome, prepared, *rest)
 
     monkeypatch.setattr(StreamingFit, "finish", finish_and_keep)
-    monkeypatch.setattr(follow_module, "write_result", write_and_keep)
+    monkeypatch.setattr(pipeline, "write_result", write_and_keep)
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
     schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain), pause=pause)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air(air),))
-    follow(options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
 
     with open_scan(tmp_path / "scan.h5") as source:
         whole = prepare_projections(source, selection, pytest.fail)  # type: ignore[arg-type]
@@ -188,22 +185,22 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
 
     live: list[Projections] = []
     judged: list[PreparedProjections] = []
-    again, write = ScanFollower._correct_again, follow_module.write_result
+    again, write = ScanFollower.correct_again, pipeline.write_result
 
     def as_it_was(self: ScanFollower, usable: UsableViews, why: str) -> None:
         live.append(self._joined())
         again(self, usable, why)
 
-    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+    def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
         judged.append(prepared)
         return write(outcome, prepared, *rest)
 
-    monkeypatch.setattr(ScanFollower, "_correct_again", as_it_was)
-    monkeypatch.setattr(follow_module, "write_result", write_and_keep)
+    monkeypatch.setattr(ScanFollower, "correct_again", as_it_was)
+    monkeypatch.setattr(pipeline, "write_result", write_and_keep)
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
     source = SourceOptions(tmp_path / "rest.h5", earlier=(tmp_path / "scan.h5",))
     goal = Goal(psnr_loss=0.01)
-    follow(options(tmp_path, source=source, selection=selection, enough=goal), events.append, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, source=source, selection=selection, enough=goal), events.append, clock)
 
     join([tmp_path / "scan.h5", tmp_path / "rest.h5"], tmp_path / "joined.h5")
     with open_scan(tmp_path / "joined.h5") as joined:
@@ -242,7 +239,7 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("3,3"),))
-    follow(options(tmp_path, selection=selection), lambda event: None, clock, RHYTHM)
+    reconstruct_file(options(tmp_path, selection=selection), lambda event: None, clock)
     assert len(corrected) == 30 and len(set(corrected)) == 30
 
 
@@ -262,5 +259,5 @@ def test_the_newest_view_does_not_wait_for_the_next_one(tmp_path: Path, monkeypa
     monkeypatch.setattr(StreamingFit, "add_views", taken)
     monkeypatch.setattr(NXtomoWriter, "append", written)
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), period=2.0)
-    follow(options(tmp_path), lambda event: None, clock, RHYTHM)
+    reconstruct_file(options(tmp_path), lambda event: None, clock)
     assert max(fed[view] - arrived[view] for view in range(30)) < RHYTHM.slice + RHYTHM.poll + 10 * TICK

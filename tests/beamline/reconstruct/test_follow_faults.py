@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
+from beamline.features.files.ingest import ingest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
-from beamline.reconstruct.follow import follow
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
-from beamline.storage.ingest import ingest
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
@@ -45,6 +45,7 @@ def _options(file: Path) -> ReconOptions:
         target=OutputPaths(file.with_name(f"{file.stem}_recon.h5"), None),
         selection=Selection(axis_col=SCAN.axis_col),
         method=R2(seconds=4.0, gaussians=200),
+        follow=RHYTHM,
         command="beamline recon scan.h5 --follow",
     )
 
@@ -69,9 +70,9 @@ def _alarm(frame: int, first: int | None = None) -> Flag:
 
 
 def _quality(file: Path, clock: Clock, events: list[Event] | None = None) -> float:
-    """PSNR in dB of what `follow` makes of a file."""
+    """PSNR in dB of what is made of a file that is followed."""
     options = _options(file)
-    follow(options, ([] if events is None else events).append, clock, RHYTHM)
+    reconstruct_file(options, ([] if events is None else events).append, clock)
     volume = read_reconstruction(options.target.output).volume
     return psnr(SCAN.truth(volume.grid), volume.data)
 
@@ -143,7 +144,8 @@ class StepClock(ScanClock):
 
 def _follow_for_real(path: Path) -> None:
     numba.set_num_threads(1)
-    follow(_options(path), lambda event: None, StepClock(), replace(RHYTHM, patience=1e4))
+    patient = replace(_options(path), follow=replace(RHYTHM, patience=1e4))
+    reconstruct_file(patient, lambda event: None, StepClock())
 
 
 @pytest.mark.slow

@@ -17,13 +17,13 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import in_time
 from beamline.reconstruct.in_time import fit_within, warnings_told
-from beamline.reconstruct.offline import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
-from recon.fields.methods import NAF
+from recon.features.neural.methods import NAF
 from recon.prep.correct import Projections
 from recon.splatting.r2 import R2
 from tests.beamline.scans import TwoCylinders, write_exchange

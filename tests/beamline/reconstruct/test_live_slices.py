@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.reconstruct.live_slices import LiveSlices
+from beamline.reconstruct.snapshots import LiveSlices
 from recon.base.geometry import Geometry
+from tests.clock import SteppedClock
 
 STEP = np.pi / 180
 GOLDEN = np.pi * (np.sqrt(5) - 1) / 2
@@ -26,17 +27,9 @@ class Drawn:
         self.headings.append(heading)
 
 
-class Clock:
-    time = 0.0
-
-    def now(self) -> float:
-        self.time += 0.1  # drawing takes so long
-        return self.time
-
-
-def live(angles: np.ndarray) -> tuple[LiveSlices, Drawn, Clock, Any]:
+def live(angles: np.ndarray) -> tuple[LiveSlices, Drawn, SteppedClock, Any]:
     """The slices, what is drawn, the clock, and the first n views."""
-    rng, drawn, clock = np.random.default_rng(0), Drawn(), Clock()
+    rng, drawn, clock = np.random.default_rng(0), Drawn(), SteppedClock(tick=0.1)  # drawing takes so long
     source = SimpleNamespace(shape=(3, 16))
     views: Any = SimpleNamespace(
         source=source,

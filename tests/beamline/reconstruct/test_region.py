@@ -57,6 +57,14 @@ def test_voxels_and_places_are_those_of_the_whole_volume(method: tuple[str, ...]
 
 
 @pytest.mark.usefixtures("folder")
+def test_the_box_around_the_sample_is_that_of_the_record() -> None:
+    found = made("-m", "fbp", "--roi", "auto", "--no-report", "-o", "auto.h5")
+    given = made("-m", "fbp", "--roi", str(found.parameters["roi"]), "--no-report", "-o", "given.h5")
+    np.testing.assert_array_equal(found.volume.data, given.volume.data)
+    assert str(found.parameters["roi_found"]).startswith("The sample lies in voxels")
+
+
+@pytest.mark.usefixtures("folder")
 def test_fbp_of_a_region_reports_no_residual() -> None:
     """A part of the volume cannot be compared with the views."""
     record = made("-m", "fbp", "--roi", "38:60,10:40,4:29", "-o", "part.h5")

@@ -20,7 +20,7 @@ import pytest
 
 from beamline.projections.selection import Selection
 from beamline.reconstruct import estimate, result
-from beamline.reconstruct import needs as module
+from beamline.reconstruct import memory as module
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slab_run import _as_they_come
@@ -171,8 +171,8 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(estimate, "costs_of", costs)
     all_of_it, rest = (
-        json.loads(beamline(*FISTA, "-o", "out.h5", *more, "--dry-run", "--json").stdout.splitlines()[-1])
-        for more in ((), ("--resume", "out.partial.h5"))
+        json.loads(beamline(*FISTA, *more, "--dry-run", "--json").stdout.splitlines()[-1])
+        for more in (("-o", "other.h5"), ("-o", "out.h5", "--resume", "out.partial.h5"))
     )
     assert (rest["seconds"], rest["least_seconds"]) == (100, 50)
     assert (all_of_it["slabs"], all_of_it["done"], rest["slabs"], rest["done"]) == (3, 0, 2, 32)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.reconstruct import estimate
-from beamline.reconstruct.needs import Needs
+from beamline.reconstruct.memory import ReconMemory
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -161,11 +161,11 @@ def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
 
 
 def test_what_is_needed_grows_with_the_scan() -> None:
-    full = Needs.of(Fbp(), 1800, (2048, 2048), 2)
+    full = ReconMemory.of(Fbp(), 1800, (2048, 2048), 2)
     assert full.line_integrals == 1800 * 2048**2 * 4 and full.volume == 2048**3 * 4
     assert 60e9 < full.at_once < 90e9
     assert full.least < 4e9 and full.slab(full.height(8_000_000_000)) < 8e9
-    tv = replace(Needs.of(OsSirtTv(), 1800, (2048, 2048), 2), weighted=False)
+    tv = replace(ReconMemory.of(OsSirtTv(), 1800, (2048, 2048), 2), weighted=False)
     assert 64 <= tv.height(32_000_000_000) < 256 and tv.slab(tv.height(32_000_000_000)) < 32e9
 
 

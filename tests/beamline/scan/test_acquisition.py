@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import InstrumentError
 from beamline.plan.plan import Mode, Place
+from beamline.plan.timeline import block_seconds, work_out
 from beamline.scan.ledger import LedgerError
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming
@@ -41,6 +42,22 @@ def test_a_scan_is_its_plan_frame_by_frame(mode: Mode, at: Place) -> None:
     done = [data for event, data in run.events if event == "block_done"]
     assert [data["frames"] for data in done] == [block.n for block in timeline.blocks]
     assert {(data["lost"], data["ignored"], data["extra"], len(data["missing"])) for data in done} == {(0, 0, 0, 0)}
+
+
+def test_between_frames_of_a_view_the_stage_neither_moves_nor_settles() -> None:
+    instrument = FakeInstrument()
+    plan = instrument.plan(n=4, mode=Mode.STEP)
+    plan = replace(plan, angles=np.repeat(plan.angles, 3), frames_per_view=3, period=0.03)
+    timeline = work_out(plan, instrument.stage.limits, instrument.stage.to_counts, instrument.camera.timing)
+    run = Run(instrument, timeline)
+    assert run.error is None
+    assert_true_angles(run)
+    views = run.of(FrameKind.PROJECTION)
+    np.testing.assert_allclose([frame.angle for frame in views], plan.angles, atol=COUNT / 2)
+    waits = np.diff([frame.time for frame in views])
+    assert (np.delete(waits, [2, 5, 8]) < 0.1).all() and (waits[[2, 5, 8]] > 0.5).all()
+    planned = block_seconds(timeline.views, instrument.stage.limits, instrument.camera.timing, plan.settle)
+    assert planned == pytest.approx(views[-1].time - views[0].time, abs=0.2)
 
 
 def test_the_frame_that_leaves_owns_its_memory() -> None:

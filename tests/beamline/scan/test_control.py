@@ -90,7 +90,7 @@ def test_only_the_owner_may_ask_and_nothing_is_left(tmp_path: Path) -> None:
 
 def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(control, "_EFFECT", 0.3)
+    monkeypatch.setattr(control, "EFFECT_WITHIN", 0.3)
     runs = [tmp_path / "runs" / name for name in ("a", "b")]
     for run in runs:
         run.mkdir(parents=True)
@@ -117,7 +117,7 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
 def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control, "_ANSWER", 0.2)
+    monkeypatch.setattr(control, "ANSWER_WITHIN", 0.2)
     with pytest.raises(ConfigError, match="no scan runs"):
         tell(tmp_path, Verb.PAUSE)
     (tmp_path / "control").mkdir(mode=0o700)

@@ -16,13 +16,13 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.config.load import config_folder, load
-from beamline.doctor.disk import needs
+from beamline.features.doctor.disk import needs
 from beamline.scan.preflight import dry_run
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.frame import FrameKind
 from simulators.devices.camera import SimulatedOrcaQuest
-from simulators.light.palette import known
+from simulators.samples.materials.palette import known
 
 pytest.importorskip("xraylib")
 ENERGIES = (8.32, 8.345, 8.3485, 8.352)

@@ -11,11 +11,11 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.core.stop import StopRequest
-from beamline.doctor.examine import examine
+from beamline.features.doctor.examine import examine
+from beamline.features.files.nexus import nexus_findings
+from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
 from beamline.scan.run import run_scan
-from beamline.scan.tune import tune
-from beamline.storage.rules.nexus import nexus_findings
 from drivers.base.errors import DeviceError
 from drivers.places import PlacedStage
 from tests.beamline import ran
@@ -107,14 +107,14 @@ def test_a_wrong_configuration_is_refused(words: tuple[str, ...], said: str) -> 
 
 def test_the_doctor_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("p4p")
-    monkeypatch.setattr("beamline.doctor.disk.MOST", 1 << 20)
+    monkeypatch.setattr("beamline.features.doctor.disk.MOST", 1 << 20)
     chosen = f"devices.filter={{kind: epics, pv: 'pva://{PREFIX}f', places: {{none: 0, Cu: 2}}, timeout_s: 0.5}}"
     settings = shipped("instrument", chosen, f"storage.folder={tmp_path}")
     served, clock = Variables({"f": 2.0}), TickingClock()
 
     def found() -> tuple[str, str]:
         (one,) = [check for check in examine(settings, clock) if check.name == "filter"]
-        return one.verdict, one.found
+        return one.verdict, one.observed
 
     with serve_pva(served, clock, monkeypatch) as ioc:
         assert found() == ("ok", "Cu.")

@@ -21,11 +21,11 @@ import pytest
 
 from beamline.config.models import StorageSection
 from beamline.core.errors import ConfigError, DataError
+from beamline.features.files.validate import validate
 from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.validate import validate
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode

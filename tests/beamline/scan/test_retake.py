@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from beamline.config.load import load
 from beamline.core.stop import ScanStopped, StopRequest
+from beamline.features.files.describe import describe
+from beamline.features.files.validate import validate
 from beamline.projections.corrections.flags import usable_views
 from beamline.projections.replay import judged_flags
 from beamline.scan.run import run_scan
-from beamline.storage.describe import describe
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.validate import validate
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran

@@ -11,13 +11,13 @@ import pytest
 from beamline.config.load import config_folder, load
 from beamline.core.events import Event
 from beamline.core.stop import ScanStopped, StopRequest
+from beamline.features.files.describe import describe
+from beamline.features.files.validate import validate
 from beamline.projections.corrections.flags import usable_views
 from beamline.projections.returned import returned_views
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan
-from beamline.storage.describe import describe
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.validate import validate
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran

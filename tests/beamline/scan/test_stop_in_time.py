@@ -22,7 +22,7 @@ from beamline.scan.control import Verb, ask, tell
 from beamline.scan.run import run_scan
 from beamline.scan.states import State, StateMachine
 from tests.beamline.fakes import HOME, FakeInstrument
-from tests.beamline.page.served import served
+from tests.beamline.features.page.served import served
 from tests.beamline.ran import small
 
 WITHIN, EXPOSURE = 2.0, 0.3  # s
@@ -167,7 +167,7 @@ def epics(held: Held) -> Surface:
 
     from p4p.client.thread import Context
 
-    from beamline.epics.ioc import RunServer
+    from beamline.features.epics.ioc import RunServer
 
     return _scan(held), opened()
 

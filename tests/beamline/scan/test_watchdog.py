@@ -143,7 +143,7 @@ def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
     monkeypatch.setattr(signal, "signal", lambda *how: None)
     read, write = os.pipe()
     os.close(read)  # the scan died before its watchdog was there, and takes no answer
-    monkeypatch.setattr(watchdog, "_STDOUT", write)
+    monkeypatch.setattr(watchdog, "STDOUT", write)
     assert watchdog.main(tmp_path, os.getpid(), io.BytesIO(b"...")) == watchdog.ACTED
     assert made == [False]
     os.close(write)

@@ -48,7 +48,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         "last_frame": 2,
         "regions": [list(A), list(B)],
     }
-    with pytest.raises(DataError, match="exists and results are never overwritten"):
+    with pytest.raises(DataError, match="are never overwritten"):
         write_labels(path, (), n_frames=1)
 
 

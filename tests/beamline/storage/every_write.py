@@ -27,14 +27,15 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
+from beamline.features.files.describe import describe
+from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
-from beamline.storage.describe import describe
 from beamline.storage.parts import views_in
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
-from beamline.storage.rules.validate import validate
-from beamline.storage.volumes import ome_zarr, tiff
+from beamline.storage.volumes.images import tiff
+from beamline.storage.volumes.zarr import ome_zarr
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter

@@ -15,13 +15,13 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.features.archive.archive import archive
+from beamline.features.files.ingest import ingest
 from beamline.monitor.digest import digest
-from beamline.storage.archive import archive
-from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
-from beamline.storage.rules.validate import scan_ended
+from beamline.storage.rules.scan import scan_ended
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.ending import DIED, ScanEnding
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -106,6 +106,8 @@ def test_a_copy_states_how_its_scan_ended(scan: Callable[[str], Path], tmp_path:
         warned = [found.message for found in scan_ended(source)]  # as validate, recon and its volume say it
     assert (ENDINGS[end].reason in "".join(warned)) and bool(warned) == (end != "complete")
     assert all(f"with 4 of {VIEWS} views" in message for message in warned)
+    if end != "failed":  # which states the most
+        return
     again = tmp_path / "again.h5"
     archive(out, again) if command != "join" else ingest(out, again)
     with open_scan(again) as source:

@@ -1,4 +1,4 @@
-"""docs/file_layout.md, scan_layout.md and volume_layout.md name what is written, and nothing else."""
+"""docs/file_layout.md names what is written, and nothing else."""
 
 from __future__ import annotations
 
@@ -15,25 +15,23 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.core.events import KINDS
+from beamline.features.files.ingest import ingest
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS
 from beamline.monitor.digest import digest
 from beamline.simulate.labels import LabelledRun, write_labels
-from beamline.simulate.truth import Truth, write_truth
-from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
-from recon.base.volume import Grid, VolumeSeries
+from recon.base.volume import VolumeSeries
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 from tests.beamline.storage.conftest import EPOCH
+from tests.beamline.storage.file_layout import PAGE, names, paths, rows, unmatched
 from tests.clock import SteppedClock
 
-DOCS = Path(__file__).parents[3] / "docs"
-PAGE = "\n".join((DOCS / f"{name}_layout.md").read_text(encoding="utf-8") for name in ("file", "scan", "volume"))
 SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
 NOT_OF_EVERY_RUN = {
     "scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html", "watchdog.log",
@@ -41,46 +39,6 @@ NOT_OF_EVERY_RUN = {
 }  # fmt: skip
 """Of simulated scans, the live reconstruction and the watchdog, whose own tests name them; and of a scan that runs or
 ends."""
-
-
-def rows(title: str) -> list[list[str]]:
-    """Cells of the tables in a section of the page, without the heads."""
-    section = re.split(r"^#+ ", PAGE, flags=re.M)
-    (text,) = [part for part in section if part.startswith(f"{title}\n")]
-    lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
-
-
-def names(title: str) -> list[str]:
-    return [row[0].strip("` ") for row in rows(title)]
-
-
-def unmatched(found: Iterable[str], named: Iterable[str]) -> tuple[set[str], set[str]]:
-    """What was found and is not on the page, and what the page names and was not found."""
-    found, pattern = set(found), {}
-    for name in named:
-        pattern[name] = re.compile(re.sub(r"<[^>]*>", "[^/]+", re.escape(name).replace(r"\ ", " ")) + r"\Z")
-    return (
-        {path for path in found if not any(p.match(path) for p in pattern.values())},
-        {name for name, p in pattern.items() if not any(p.match(path) for path in found)},
-    )
-
-
-def paths(*files: Path) -> set[str]:
-    """Every dataset in HDF5 files, by every name that leads to it."""
-    found: set[str] = set()
-
-    def walk(group: h5py.Group) -> None:
-        for name, item in group.items():
-            if isinstance(item, h5py.Group):
-                walk(item)
-            else:
-                found.add(f"{group.name.rstrip('/')}/{name}")
-
-    for path in files:
-        with h5py.File(path) as file:
-            walk(file)
-    return found
 
 
 @pytest.fixture
@@ -128,6 +86,7 @@ def test_the_flags() -> None:
     assert f"`{ALARM_SHIFT} + b`" in PAGE
 
 
+@pytest.mark.slow
 def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with NXtomoWriter(path, ScanInfo("s", pixel_size_mm=0.5), SCAN.shape, clock=SteppedClock(EPOCH)) as writer:
@@ -148,18 +107,17 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     record = read_reconstruction(tmp_path / "bars.h5")
     assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
     write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
+    fitted, centres = read_reconstruction(tmp_path / "r2.h5"), np.ones((SCAN.angles.size, 3))
+    rest = {"view_centres_mm": centres, "roi": "0:4,0:4,0:4", "roi_found": "4 of 8 slices", "frames_per_view": 2}
+    parameters = {**fitted.parameters, **rest}
+    model = {**fitted.model, "view_centres": centres}
+    write_reconstruction(tmp_path / "free.h5", replace(fitted, parameters=parameters, model=model))
     series = VolumeSeries(np.zeros(2), np.stack([record.volume.data] * 2))
     write_reconstruction(tmp_path / "series.h5", replace(record, series=series))
-    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful", "series")))
+    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful", "free", "series")))
     assert unmatched(volumes, names("Volume file")) == (set(), set())
     assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
     assert_on_the_page(events)
-
-
-def test_truth_file(tmp_path: Path) -> None:
-    grid = Grid((2, 3, 4), 0.5)
-    write_truth(tmp_path / "t.h5", Truth(grid, np.ones(grid.shape, "f4"), np.ones(grid.shape, "u1"), ("ellipsoid",)))
-    assert unmatched(paths(tmp_path / "t.h5"), names("Truth file")) == (set(), set())
 
 
 def test_labels(tmp_path: Path) -> None:

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beamline.features.files.describe import describe
+from beamline.features.files.ingest import ingest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest
-from beamline.storage.describe import describe
 from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, mark_of, read_legend
-from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame, FrameKind

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.storage.describe import describe
+from beamline.features.files.describe import describe
 from beamline.storage.header import dtype_of, require_held, shape_of
 from beamline.storage.volume_file import read_volume
-from beamline.storage.volumes import tiff
 from beamline.storage.volumes.files import opened_volume, write_volume
+from beamline.storage.volumes.images import tiff
 from tests.beamline.storage.volumes.test_files import RECORD
 
 NUMBERS: tuple[Any, ...] = (
@@ -159,10 +159,10 @@ def test_npy(tmp_path: Path, shape: str) -> None:
 def test_tiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, n: Any) -> None:
     path, key = tmp_path / f"v{suffix}", "shape" if suffix else "slices"
     write_volume(path, RECORD)
-    facts = tiff._facts(path if suffix else path / "slice_00000.tif")
+    facts = tiff.facts_of_imagej(path if suffix else path / "slice_00000.tif")
     assert facts is not None
     for said in (n, [n, 4, 5], [3, 4, n]):
-        monkeypatch.setattr(tiff, "_facts", lambda path, said=said: {**facts, key: said})
+        monkeypatch.setattr(tiff, "facts_of_imagej", lambda path, said=said: {**facts, key: said})
         with pytest.raises(DataError):
             _read_all(path)
 

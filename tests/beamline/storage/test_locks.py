@@ -115,7 +115,7 @@ def test_a_file_that_another_program_has_open_to_write(tmp_path: Path) -> None:
         [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout is not None and other.stdout.readline().strip() == "ready"
-        with pytest.raises(DataError, match="is held by another program, which has it open to write"):
+        with pytest.raises(DataError, match="open to write"):
             hdf5.open_hdf5(path)
         other.communicate("")
     with hdf5.open_hdf5(path) as file:
@@ -127,9 +127,9 @@ import os, sys
 from pathlib import Path
 from beamline.config.load import load
 from beamline.core.errors import DataError
-from beamline.doctor.disk import locks
+from beamline.features.doctor.disk import locks
 from beamline.scan.preflight import dry_run
-from beamline.storage.describe import describe
+from beamline.features.files.describe import describe
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock

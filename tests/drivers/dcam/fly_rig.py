@@ -15,7 +15,7 @@ from uuid import uuid4
 from beamline.instrument.connect import ConnectedDevices
 from drivers.base.protocols import Devices
 from drivers.dcam.camera import DcamCamera
-from drivers.dcam.options import DcamOptions
+from drivers.orca_quest import DcamOptions
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures

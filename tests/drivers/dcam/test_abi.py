@@ -62,7 +62,7 @@ def test_layout_is_that_of_a_c_compiler(world) -> None:
 
 
 def test_a_missing_library_is_named_with_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match=r"camera: .*nowhere\.so cannot be loaded .*Install the vendor's DCAM-API"):
+    with pytest.raises(DeviceError, match=r"camera: .*nowhere\.so.*vendor's DCAM-API"):
         abi.Dcam(tmp_path / "nowhere.so", "camera")
 
 
@@ -101,7 +101,7 @@ def test_without_a_path_the_installed_library_is_looked_for() -> None:
     try:
         ctypes.CDLL("libdcamapi.so")
     except OSError:
-        with pytest.raises(DeviceError, match=r"libdcamapi\.so cannot be loaded"):
+        with pytest.raises(DeviceError, match=r"libdcamapi\.so"):
             abi.Dcam(None, "camera")
     else:
         pytest.skip("the vendor's library is installed here")
@@ -111,7 +111,7 @@ def test_a_library_of_another_kind_is_refused_with_the_missing_calls(fake_librar
     source, library = tmp_path / "old.c", tmp_path / "libold.so"
     source.write_text("int dcamapi_init(void *p) { return p != 0; }\n")
     subprocess.run([compiler(), "-shared", "-fPIC", str(source), "-o", str(library)], check=True)
-    with pytest.raises(DeviceError, match=r"lacks dcamapi_uninit, dcamdev_open.*Nothing was changed"):
+    with pytest.raises(DeviceError, match=r"dcamapi_uninit, dcamdev_open.*Nothing was changed"):
         abi.Dcam(library, "camera")
 
 

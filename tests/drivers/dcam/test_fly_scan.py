@@ -20,7 +20,7 @@ from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
-from drivers.dcam.options import DcamOptions, TriggerPolarity
+from drivers.orca_quest import DcamOptions, TriggerPolarity
 from tests.drivers.dcam.fly_rig import COUNTS, SENSOR, FlyRig
 
 EXTERNAL = CameraSettings(0.002, TriggerSource.EXTERNAL)

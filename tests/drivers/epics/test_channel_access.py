@@ -84,6 +84,6 @@ def test_a_motor_record_moves_until_its_ioc_dies(ioc: ProcessVariable) -> None:
     stage = EpicsStage(url, flat(EpicsSettings, **(USUAL | {"timeout": 2.0})), clock)
     stage.start_move(math.radians(80), math.radians(2))
     ioc.write("number", 666)
-    with pytest.raises(DeviceTimeout, match=r"T:m1\.RBV.*EPICS_CA_ADDR_LIST for ca://"):
+    with pytest.raises(DeviceTimeout, match=r"T:m1\.RBV.*EPICS_CA_ADDR_LIST"):
         stage.wait(60)
     stage.close()

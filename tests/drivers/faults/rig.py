@@ -358,7 +358,7 @@ class Rig:
         )
         monkeypatch.setattr(run_module, "connect", self._connect)
         monkeypatch.setattr(run_module, "verbs_taken", self._verbs_taken)
-        monkeypatch.setattr(run_module, "_wait_in_pause", self._wait_in_pause)
+        monkeypatch.setattr(run_module, "wait_in_pause", self._wait_in_pause)
         monkeypatch.setattr(run_module, "watched", lambda *how: nullcontext())  # a process a scan
         monkeypatch.setattr(run_module, "Recorder", partial(_Recorder, self.at_frame))
 

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from beamline.config.devices import DcamOrca
-from beamline.doctor import devices as doctor
-from beamline.doctor.check import Grade
+from beamline.features.doctor import devices as doctor
+from beamline.features.doctor.check import Grade
 from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property
 from tests.drivers.dcam.fake import World
+from tests.drivers.dcam.usb_bus import Bus, Descriptor
 from tests.drivers.faults import table
 from tests.drivers.faults.aftermath import (
     assert_at_rest,
@@ -25,7 +26,6 @@ from tests.drivers.faults.aftermath import (
     assert_speaks,
 )
 from tests.drivers.faults.rig import VIEWS, Rig, Scanned
-from tests.drivers.usb_bus import Bus, Descriptor
 
 RigOf = Callable[..., Rig]
 ROWS = {row.fault: row for row in table.CAMERA}
@@ -105,7 +105,7 @@ def test_an_error_of_the_library(rig: Rig, call: str, calls_of_a_scan: dict[str,
             assert_speaks(scanned.error, "camera")
             assert reports == []
         assert_at_rest(rig, scanned)
-        assert_next_scan_works(rig, tmp_path)
+    assert_next_scan_works(rig, tmp_path)
 
 
 @pytest.mark.parametrize("call", sorted(AT_CONNECTING))
@@ -216,7 +216,7 @@ def test_slow_link(rig: Rig, tmp_path: Path) -> None:
     """The doctor says so before; a scan all the same loses the frames that the link does not carry, and names them."""
     check = doctor.link(DcamOrca(kind="dcam"), Bus(Descriptor(speed=3)))
     assert check.verdict is Grade.FAILED
-    assert "480 Mbit/s" in check.found and "USB 3 cable" in check.advice
+    assert "480 Mbit/s" in check.observed and "USB 3 cable" in check.advice
     odd = list(range(1, VIEWS - 1, 2))
     rig.world.lose(*odd)
     scanned = rig.scan(tmp_path)

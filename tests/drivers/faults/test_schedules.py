@@ -15,11 +15,11 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
+from beamline.features.files.validate import validate
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import SAFE, UNSAFE
 from beamline.scan.states import State
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.rules.validate import validate
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Rig, Scanned

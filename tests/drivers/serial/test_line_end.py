@@ -95,7 +95,7 @@ def test_closing_waits_for_the_request_of_another_thread() -> None:
 @pytest.mark.parametrize("timeout", [0.0, -1.0, math.nan, math.inf])
 def test_an_invalid_timeout_is_refused(timeout: float) -> None:
     clock = VirtualClock()
-    with pytest.raises(DeviceRefused, match=r"timeout.*positive number of seconds.*Nothing was sent"):
+    with pytest.raises(DeviceRefused, match=r"timeout.*number of seconds.*Nothing was sent"):
         connect(register(next(NAMES), Answers(clock)), clock, timeout=timeout)
 
 

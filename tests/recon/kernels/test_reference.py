@@ -24,7 +24,7 @@ Parameters = tuple[Tensor, Tensor, Tensor, Tensor]
 ANGLES, SHAPE = (0.4, -2.7), (7, 8)
 SET_UP = {"axis_col": 3.1, "axis_row": 2.2, "shifts": ((0.4, -0.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": 0.3}
 PARALLEL = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=1.1, **SET_UP)
-CONE = Geometry.cone(ANGLES, SHAPE, 1.6, 25.0, 36.0, **SET_UP)
+CONE = Geometry.cone(ANGLES, SHAPE, 1.6, 25.0, 36.0, **SET_UP).about(((0.8, -1.5, 0.6), (-1.1, 0.4, 2.0)))
 
 
 def some(rng: np.random.Generator, n: int = 12, extent: float = 6.0, scales: F64 | None = None) -> Parameters:
@@ -50,7 +50,7 @@ def along_the_rays(parameters: Parameters, geometry: Geometry, view: int, kernel
     for row, col in np.ndindex(*image.shape):
         u, v = (col - col0) * geometry.pixel_pitch, (row - row0) * geometry.pixel_pitch
         if geometry.is_cone:
-            source = -geometry.sod * d_axis
+            source = geometry.centres[view] - geometry.sod * d_axis
             direction = u * u_axis + v * v_axis + geometry.sdd * d_axis
             direction /= np.linalg.norm(direction)
             start = source - (source @ direction) * direction  # the ray's point nearest to the middle

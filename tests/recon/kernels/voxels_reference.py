@@ -23,12 +23,12 @@ def system_matrix(geometry: Geometry, grid: Grid) -> sparse.csr_array:
     parts = []
     for view in range(geometry.n_views):
         along_u, along_v, beam = geometry.axes(view)[:, ::-1]  # (z, y, x)
-        col0, row0 = geometry.origin(view)
+        (col0, row0), centre = geometry.origin(view), geometry.centres[view, ::-1]
 
         def ray(row: float, col: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             on_detector = (along_u * (col - col0) + along_v * (row - row0)) * geometry.pixel_pitch  # noqa: B023
             if geometry.is_cone:
-                return -geometry.sod * beam, on_detector + geometry.sdd * beam  # noqa: B023
+                return centre - geometry.sod * beam, on_detector + geometry.sdd * beam  # noqa: B023
             return on_detector, beam  # noqa: B023
 
         for row in range(rows):

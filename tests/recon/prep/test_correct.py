@@ -185,7 +185,7 @@ def test_stacks_of_darks_and_flats_count_by_their_means(rng: np.random.Generator
     camera = np.stack([np.full((2, 5), n, np.uint16) for n in (65535, 65533)])  # their sum is beyond 16 bits
     assert (References(camera, ((0.0, camera[:1]),)).dark == 65534).all()
     assert references.rows(slice(0, 2)).dark.shape == (2, 48)
-    with pytest.raises(ValueError, match=r"stack of flats at 7 is empty"):
+    with pytest.raises(ValueError, match=r"at 7 is"):
         References(references.dark, ((7.0, camera[:0]),))
 
 
@@ -364,17 +364,17 @@ def test_bad_input_is_refused_with_its_values() -> None:
         correct(counts, at[1:], references)
     with pytest.raises(ValueError, match=r"shape \(16, 48\)"):
         correct(counts[0], at, references)
-    with pytest.raises(ValueError, match=r"position of its own, got \[3"):
+    with pytest.raises(ValueError, match=r"got \[3"):
         correct(counts, at, References(dark, ((3.0, flat), (3.0, flat))))
     with pytest.raises(ValueError, match=r"\(40, 9\) do not fit 48"):
         correct(counts, at, references, CorrectionSettings(air=(40, 9)))
     with pytest.raises(ValueError, match=r"positions of views \[2\]"):
         correct(counts, np.where(at == 2, np.nan, at), references)
-    with pytest.raises(ValueError, match=r"masked must have shape \(16, 48\), got \(5, 5\)"):
+    with pytest.raises(ValueError, match=r"\(16, 48\), got \(5, 5\)"):
         correct(counts, at, references, masked=np.zeros((5, 5), bool))
-    with pytest.raises(ValueError, match=r"view_ids must have shape \(6,\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"shape \(6,\), got \(2,\)"):
         correct(counts, at, references, view_ids=np.arange(2))
-    with pytest.raises(ValueError, match="nothing to fill them from"):
+    with pytest.raises(ValueError, match="fill them from"):
         correct(counts, at, references, masked=np.ones((16, 48), bool))
     with pytest.raises(ValueError, match="floor"):
         CorrectionSettings(floor=0)
@@ -390,7 +390,7 @@ def test_views_without_values_or_beam_are_named() -> None:
     with pytest.raises(ValueError, match="view 4: 768 of 768"):
         correct(lost, at, references)
     counts[2] = references.dark
-    with pytest.raises(ValueError, match=r"no beam in 1 of 6 views \(\[2\]"):
+    with pytest.raises(ValueError, match=r"1 of 6 views \(\[2\]"):
         correct(counts, at, references, CorrectionSettings(air=(4, 4)))
 
 

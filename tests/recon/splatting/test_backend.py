@@ -132,7 +132,7 @@ def test_bounds_hold_after_an_update_and_none_means_unbounded(rng: np.random.Gen
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(backend_for("cpu"), Cpu)
     for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
-        with pytest.raises(ValueError, match=rf"'{unknown}' was asked for.*'cpu' or on 'cuda'.*Name one of these"):
+        with pytest.raises(ValueError, match=rf"'{unknown}' was.*'cpu'.*one of these"):
             backend_for(unknown)
     for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
         monkeypatch.delitem(sys.modules, name)
@@ -150,7 +150,5 @@ def test_a_cuda_device_that_is_not_there_is_said_by_name(device: str) -> None:
 
     if gpu.interpreted():
         pytest.skip("the interpreter stands in for any device")
-    with pytest.raises(
-        RuntimeError, match=rf"device {device} was asked for, but torch .* sees no CUDA device.*on the cpu"
-    ):
+    with pytest.raises(RuntimeError, match=rf"{device} was.*CUDA.*on the cpu"):
         backend_for(device)

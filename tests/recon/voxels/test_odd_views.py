@@ -83,6 +83,16 @@ def test_rays_that_were_not_measured_show_nothing(geometry: Geometry, rng: np.ra
     assert [odd.view for odd in odd_views(volume, views, geometry)] == [30]
 
 
+def test_views_without_noise_are_not_compared_finer_than_a_fit_ends(geometry: Geometry) -> None:
+    data = gaussian_filter(_sample(geometry)[0].data, 4)  # whose finest detail counts as noise
+    volume = Volume(data, Grid.matching(geometry))
+    views = Projector(geometry, volume.grid).forward(data)
+    views[20] += _speck(15, 40, 0.004 * float(views.max()))
+    assert odd_views(volume, views, geometry) == ()
+    views[30] += _speck(15, 40, 0.2)
+    assert [odd.view for odd in odd_views(volume, views, geometry)] == [30]
+
+
 def test_few_views_say_nothing() -> None:
     geometry = Geometry.parallel(TURN[:24], (ROWS, COLS))
     volume, clean = _sample(geometry)

@@ -52,7 +52,7 @@ def _number(draw: st.DrawFn, low: float, high: float) -> float:
 
 @st.composite
 def cases(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
-    """Small set-ups of either beam: any angles, axis, shifts, roll and tilt of views, box and voxel, and a seed."""
+    """Small set-ups of either beam: any angles, axis, shifts, roll, tilt and centres, box and voxel, and a seed."""
     number = partial(_number, draw)
     views = draw(st.integers(1, 3))
     angles = [draw(st.sampled_from([0.0, np.pi / 4, np.pi / 2])) if draw(st.booleans()) else number(-7, 7)
@@ -65,6 +65,8 @@ def cases(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
     if draw(st.booleans()):
         geometry = Geometry.cone(angles, detector, number(0.5, 3), 20.0, number(20, 60), axis_col=axis_col,
                                  axis_row=axis_row, shifts=shifts, roll=roll, tilt=tilt)  # fmt: skip
+        if draw(st.booleans()):
+            geometry = geometry.about([[number(-3, 3) for _ in range(3)] for _ in range(views)])
     else:
         geometry = Geometry.parallel(angles, detector, pixel_pitch=number(0.5, 2), axis_col=axis_col, axis_row=axis_row,
                                      shifts=shifts, roll=roll, tilt=tilt)  # fmt: skip
@@ -255,7 +257,7 @@ def ellipsoid_shadow(geometry: Geometry, axes: NDArray[np.float64], centre: NDAr
         col0, row0 = geometry.origin(view)
         u, v = np.meshgrid(np.arange(cols) - col0, np.arange(rows) - row0)
         on_detector = (u[..., None] * along_u + v[..., None] * along_v) * geometry.pixel_pitch
-        origin = -geometry.sod * beam if geometry.is_cone else on_detector
+        origin = geometry.centres[view] - geometry.sod * beam if geometry.is_cone else on_detector
         run = on_detector + geometry.sdd * beam if geometry.is_cone else np.broadcast_to(beam, on_detector.shape)
         p, d = (origin - centre) / axes, run / axes
         a, b, c = (d * d).sum(-1), (p * d).sum(-1), (p * p).sum(-1) - 1

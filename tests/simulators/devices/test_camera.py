@@ -327,7 +327,7 @@ def test_software_triggers_faster_than_the_camera_are_refused() -> None:
     bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.SOFTWARE))
     bench.camera.arm(2)
     bench.camera.software_trigger()
-    with pytest.raises(DeviceRefused, match=r"ready for the next trigger in 10\.2 ms"):
+    with pytest.raises(DeviceRefused, match=r"in 10\.2 ms"):
         bench.camera.software_trigger()
     assert bench.camera.next_frame(1.0).framestamp == 0
 

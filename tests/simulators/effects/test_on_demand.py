@@ -35,6 +35,7 @@ def test_every_effect_shows_in_some_frame(name: str) -> None:
     assert not on_demand.same(on_demand.frames(on_demand.scene([name])), on_demand.frames(on_demand.scene([])))
 
 
+@pytest.mark.slow
 def test_without_an_effect_named_its_module_is_not_imported_and_the_frames_are_the_same_without_it() -> None:
     """For each effect: a scene with all others, with its module and without it, in one other process."""
     program = [sys.executable, "-m", "tests.simulators.effects.without_its_module"]

@@ -55,7 +55,7 @@ def test_the_other_way_round_would_be_another_frame(earlier: str, later: str) ->
 
 @pytest.mark.parametrize("name", ["dark_current", "saturation", "dead_pixels"])
 def test_the_readout_ends_the_electrons(name: str) -> None:
-    with pytest.raises(SceneError, match=f"'{name}' must come before 'read_noise', which ends the electrons"):
+    with pytest.raises(SceneError, match=f"'{name}' must"):
         _scene("read_noise", name)
 
 

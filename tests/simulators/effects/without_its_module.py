@@ -19,8 +19,12 @@ from tests.simulators.effects import on_demand
 NAMES = list(CATALOGUE)
 
 
+def _module(name: str) -> str:
+    return f"{CATALOGUE[name].package}.{name}"
+
+
 def _imported() -> list[str]:
-    return [name for name in NAMES if f"simulators.effects.{name}" in sys.modules]
+    return [name for name in NAMES if _module(name) in sys.modules]
 
 
 def _imports(name: str) -> list[str]:
@@ -28,7 +32,7 @@ def _imports(name: str) -> list[str]:
     kept = {key: module for key, module in sys.modules.items() if key.split(".")[0] == "simulators"}
     for key in kept:
         del sys.modules[key]
-    importlib.import_module(f"simulators.effects.{name}")
+    importlib.import_module(_module(name))
     found = _imported()
     for key in [key for key in sys.modules if key.split(".")[0] == "simulators"]:
         del sys.modules[key]
@@ -39,7 +43,7 @@ def _imports(name: str) -> list[str]:
 def _without(name: str) -> str:
     """What goes wrong with the frames of all others where its module cannot be imported; empty if nothing does."""
     scene = on_demand.scene([other for other in NAMES if other != name])
-    with_it, key = on_demand.frames(scene), f"simulators.effects.{name}"
+    with_it, key = on_demand.frames(scene), _module(name)
     module = sys.modules.pop(key)
     sys.modules[key] = None  # type: ignore[assignment]  # to Python: there is none
     try:

@@ -174,9 +174,9 @@ def test_a_converter_of_ones_own_has_its_electrons_a_count() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(IndexError, match=r"frame 11 is not one of the scan's 0 \.\.\. 10"):
+    with pytest.raises(IndexError, match=r"scan's 0 \.\.\. 10"):
         _scan().frame(11)
-    with pytest.raises(ValueError, match="at least one view, got 0"):
+    with pytest.raises(ValueError, match="got 0"):
         _scan(views=0)
     for changes, words in (
         ({"detector": {"shape": [2400, 100]}}, "do not lie on the sensor of 2304 x 4096"),

@@ -133,7 +133,7 @@ def test_the_same_surface_in_a_cone() -> None:
 
 
 def test_a_surface_that_no_ray_tells_is_refused() -> None:
-    with pytest.raises(DataError, match="too few rays miss the sample"):
+    with pytest.raises(DataError, match="miss the sample"):
         without_background(_views(Cylinder(60.0, 60.0, 0.02)), GEOMETRY, 2)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.projections.corrections.hardening import in_beam
+from beamline.projections.corrections.beam_hardening.hardening import in_beam
 from recon.prep.matter import mass_attenuation
 
 

@@ -84,6 +84,16 @@ def test_binned_pixels_have_the_photons_of_all() -> None:
         assert found.photons.variance == pytest.approx(READOUT**2 / 4, rel=0.2)
 
 
+def test_the_mean_of_frames_has_the_photons_of_all() -> None:
+    for gain in (None, GAIN):
+        averaged = scan(20)
+        averaged.frames_per_view = 5  # type: ignore[misc]
+        found = ScanCorrection(averaged, PLAIN.with_steps(CountModel("counts", gain)), pytest.fail)  # type: ignore[arg-type]
+        assert found.photons is not None
+        assert found.photons.gain == pytest.approx(GAIN / 5, rel=0.1)
+        assert found.photons.variance == pytest.approx(READOUT**2 / 5, rel=0.2)
+
+
 def test_batches_give_what_one_pass_gives() -> None:
     selection = PLAIN.with_steps(CountModel("counts"))
     whole = ScanCorrection(scan(20), selection, pytest.fail).at_once(np.arange(30, 40))  # type: ignore[arg-type]

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.beam_hardening.hardening import Hardening
+from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.flags import Flags, usable_views
-from beamline.projections.corrections.hardening import Hardening
-from beamline.projections.corrections.jumps import Jumps
-from beamline.projections.corrections.phase import Phase
+from beamline.projections.corrections.jumps.jumps import Jumps
+from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.references import Flats
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
-from beamline.projections.corrections.rings import Rings
+from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
-from beamline.reconstruct.needs import Needs, needs_of
+from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.base import ScanSource
@@ -33,7 +33,7 @@ from recon.prep.correct import Projections
 from recon.prep.dynamic_flats import DynamicFlats, find_dynamic_flats, search_memory, view_memory
 from recon.prep.resample import Distortion
 from recon.voxels.direct import Fbp
-from tests.beamline.projections.corrections import test_jumps as of_jumps
+from tests.beamline.projections.corrections.jumps import test_jumps as of_jumps
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 LENS = Distortion.parse("xcenter = 80\nycenter = 120\nfactor0 = 1.0\nfactor1 = 2e-5\n")
@@ -67,11 +67,11 @@ def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
     return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.angles[views]))
 
 
-def needs(path: Path, *steps: PrepStep) -> Needs:
+def needs(path: Path, *steps: PrepStep) -> ReconMemory:
     output = OutputPaths(path.with_name("out.h5"), None)
     options = ReconOptions(SourceOptions(path), output, Selection(steps=steps), Fbp())
     with open_scan(SourceOptions(path)) as source:
-        return needs_of(source, options)
+        return recon_memory_of(source, options)
 
 
 @pytest.mark.parametrize("step", ON_VIEWS, ids=["tilt", "lens", "phase", "unsharp"])

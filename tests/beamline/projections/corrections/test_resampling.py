@@ -135,10 +135,10 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
 
 def test_what_cannot_be_levelled_is_refused() -> None:
     source = _source(0.0)
-    with pytest.raises(ConfigError, match="--tilt is for a parallel beam; array is a cone"):
+    with pytest.raises(ConfigError, match="--tilt"):
         _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
-    with pytest.raises(ConfigError, match="--tilt and --distortion mix neighbouring pixels"):
+    with pytest.raises(ConfigError, match="--tilt and --distortion"):
         _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), CountModel("counts")))
     few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
-    with pytest.raises(DataError, match="the tilt of the axis was not found"):
+    with pytest.raises(DataError, match="was not found"):
         _prepared(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.calibrate import Calibrate
+from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.width import Width
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepDone, options_of
 from beamline.reconstruct.followed_views import FollowedViews
-from beamline.simulate.scene_file import Scan, open_scene
-from beamline.simulate.write import write_scan
-from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
-from simulators.devices.clock import VirtualClock
 from tests.beamline.array_source import ArraySource
 
 SHAPE = (64, 200)
@@ -137,21 +132,6 @@ def test_other_words_are_refused(words: dict[str, str]) -> None:
     (field, text), options = *words.items(), options_of(Width)
     with pytest.raises(ValueError, match="is neither"):
         options[field].parse(text)
-
-
-@pytest.mark.parametrize("effects", [["motion_blur", "rolling_shutter"], []])
-def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: list[str]) -> None:
-    sizes = ["detector.shape=[4, 16]", "scan.views=6", "scan.darks=1", "scan.flats=1", "phantom.n_particles=5"]
-    scene = open_scene("fast_fly", [*sizes, f"effects={effects}"])
-    scan = Scan.of(scene.scene)
-    write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
-    with open_scan(tmp_path / "scan.h5") as source:
-        geometry = geometry_of(source, Selection(), 7.5, source.angles[2:])
-        seen, done = Width(arc="auto").rays(source, Selection(), geometry)
-        assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
-    moved = math.radians(180) / 6 / scan.period * 0.012
-    assert seen.width.arc == pytest.approx(moved if effects else 0)
-    assert (done.sentence != "") == bool(effects)
 
 
 def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:

@@ -25,7 +25,7 @@ def test_text_is_degrees_and_arrays_are_radians(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", ["", "# nothing\n", "0 1\n2 3\n", "zero\n"])
 def test_what_is_no_list_of_angles_is_refused(content: str) -> None:
-    with pytest.raises(DataError, match="one angle in degrees a line"):
+    with pytest.raises(DataError, match="degrees a line"):
         parse_angles(content, "a.txt")
 
 
@@ -53,7 +53,7 @@ def test_one_angle_a_projection_or_one_a_frame() -> None:
     frames = Frames(KEY)
     np.testing.assert_array_equal(assign(frames, np.array([1.0, 2, 3]), "a"), [np.nan, np.nan, 1, 2, 3, np.nan, np.nan])
     np.testing.assert_array_equal(assign(frames, np.arange(7.0), "a"), np.arange(7.0))
-    with pytest.raises(DataError, match=r"a has 4 angles, but there are 3 projections among 7 frames"):
+    with pytest.raises(DataError, match=r"has 4 angles"):
         assign(frames, np.arange(4.0), "a")
 
 
@@ -70,7 +70,7 @@ def test_a_log_of_all_frames_is_refused_where_their_order_is_unknown(before: int
     scan = np.radians(np.linspace(0, 178, views))
     log = np.concatenate((np.full(before, stands), scan, np.full(4 - before, stands)))
     frames = Frames(REFERENCES + [0] * views, in_order=False)
-    with pytest.raises(DataError, match="does not say when its darks and flats were taken") as refused:
+    with pytest.raises(DataError, match="flats were taken") as refused:
         assign(frames, log, "log.txt")
     advised = re.search(r"--angle-rows (\d+:\d+) takes", str(refused.value))
     assert advised is None or advised[1] == f"{before}:{before + views}"
@@ -112,7 +112,7 @@ def test_lost_images_never_move_the_angles_of_others(data: st.DataObject) -> Non
 
 def test_the_gap_is_named_where_the_angles_fit_nothing() -> None:
     frames = Frames([0] * 9, numbers=[0, 1, 2, 3, 5, 6, 7, 8, 9])
-    with pytest.raises(DataError, match=r"go from 0 to 9 and leave out some: of 10 angles, one for each number"):
+    with pytest.raises(DataError, match=r"from 0 to 9"):
         assign(frames, np.linspace(0, 3, 8), "a")
 
 

@@ -15,7 +15,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import parts_joined
+from beamline.storage.rules.scan import parts_joined
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -92,5 +92,5 @@ def test_parts_of_other_scans_are_refused(tmp_path: Path) -> None:
     for name, shape in (("one.h5", SCAN.shape), ("two.h5", (8, 8))):
         with _writer(tmp_path / name, shape):
             pass
-    with pytest.raises(DataError, match=r"one\.h5 .*\(4, 40\).* they are no parts of one scan"):
+    with pytest.raises(DataError, match=r"one\.h5 .*\(4, 40\).*of one scan"):
         SourceOptions(tmp_path / "two.h5", earlier=(tmp_path / "one.h5",)).open()

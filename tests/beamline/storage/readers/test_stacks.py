@@ -61,7 +61,7 @@ def test_a_unit_that_is_given_goes_before_the_file(path: Path, unit: str) -> Non
 def test_of_one_angle_for_each_frame_those_of_the_projections_are_named(path: Path) -> None:
     """Nothing says whether darks and flats were taken before the projections or after them."""
     said = {**PATHS, "angles_path": "/motors/of_all", "angles_unit": "deg"}
-    with pytest.raises(DataError, match=r"has 10 angles, one for each frame, .* --angle-rows A:B which 5 belong"):
+    with pytest.raises(DataError, match=r"10 angles.*--angle-rows"):
         open_scan(SourceOptions(path, **said))
     with open_scan(SourceOptions(path, **said, angle_rows="2:7")) as source:
         np.testing.assert_allclose(np.degrees(source.angles[5:]), np.linspace(0, 450, 10)[2:7])
@@ -115,10 +115,10 @@ def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, Any], messa
 
 
 def test_a_layout_that_is_not_known_says_what_the_file_has(path: Path) -> None:
-    with pytest.raises(DataError, match=r"no scan of a format that is read.* /raw/images \(5 x 4 x 6\).*--data-path"):
+    with pytest.raises(DataError, match=r"that is read.* /raw/images \(5 x 4 x 6\).*--data-path"):
         open_scan(path)
-    with pytest.raises(DataError, match=r"cannot be followed with --data-path, --angles-path: .* must fit all frames"):
+    with pytest.raises(DataError, match=r"--data-path, --angles-path:.*fit all frames"):
         open_scan(SourceOptions(path, **PATHS), follow=True)
     (path.parent / "s.txt").write_text("no")
-    with pytest.raises(DataError, match="cannot be read as HDF5"):
+    with pytest.raises(DataError, match="HDF5"):
         open_scan(SourceOptions(path.parent / "s.txt", **PATHS))

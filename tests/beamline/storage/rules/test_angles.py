@@ -5,6 +5,8 @@ Scans of balls by the formula of a sphere's chord; one sample is wider than the 
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -122,9 +124,29 @@ def test_angles_in_another_order_than_the_frames_are_told(
     assert hit.severity == severity and says in hit.message
 
 
-@pytest.mark.parametrize("balls", [WITHIN, WIDER, ROUND, ROD], ids=["within", "wider", "round", "rod"])
+ORDERS = [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, turn(720, 128), np.r_[EVEN, EVEN]]
+
+
 @pytest.mark.parametrize(
-    "true", [EVEN, EVEN[::-1], EVEN[PASSES], EVEN[MIXED], GOLDEN, GOLDEN % 180, turn(720, 128), np.r_[EVEN, EVEN]]
+    ("balls", "true"),
+    [*product([WITHIN, WIDER], ORDERS), *product([ROUND, ROD], [EVEN, EVEN[MIXED], GOLDEN])],
 )
 def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: NDArray[np.float64]) -> None:
     assert ordered(scan(balls, true, true)) == []
+
+
+@pytest.mark.parametrize("balls", [WITHIN, WIDER], ids=["within", "wider"])
+@pytest.mark.parametrize(
+    ("true", "stated"),
+    [
+        (np.roll(EVEN, 32), EVEN),
+        (np.roll(EVEN, 3), EVEN),
+        (GOLDEN % 360, GOLDEN % 180),
+    ],
+    ids=["halves exchanged", "from the fourth on", "golden, modulo half a turn"],
+)
+def test_neighbours_that_are_mirror_images_are_named(
+    balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64]
+) -> None:
+    (hit,) = ordered(scan(balls, true, stated))
+    assert hit.severity == "warning" and "are mirror images" in hit.message

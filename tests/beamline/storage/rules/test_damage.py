@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -13,10 +14,10 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.storage.describe import describe
-from beamline.storage.ingest import ingest
+from beamline.features.files.describe import describe
+from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import validate
 from beamline.storage.recover import recover
-from beamline.storage.rules.validate import validate
 from drivers.base.frame import Frame
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.beamline.storage.conftest import SHAPE
@@ -36,9 +37,10 @@ def test_a_flipped_bit_of_any_pixel_is_found_in_its_frame(
     write: Write, frames: list[Frame], rng: np.random.Generator
 ) -> None:
     path = write(frames)
+    rows = 0, 4, 13  # a dark, a flat, a view
     with h5py.File(path) as file:
-        offsets = [file[f"{DETECTOR}/data"].id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in range(14)]
-    for row in range(14):
+        offsets = {row: file[f"{DETECTOR}/data"].id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in rows}
+    for row in rows:
         at, bit = offsets[row] + int(rng.integers(2 * SHAPE[0] * SHAPE[1])), int(rng.integers(8))
         flip(path, at, bit)
         told: list[tuple[int, int]] = []
@@ -94,15 +96,22 @@ ALTERATIONS = {
 }
 
 
-@pytest.mark.parametrize(
-    "where",
-    ["instrument/detector/image_key", "frame_log/flags", "progress/frames_committed", "progress/status", "record/plan"],
+PLACES = (
+    "instrument/detector/image_key",
+    "frame_log/flags",
+    "progress/frames_committed",
+    "progress/status",
+    "record/plan",
 )
+
+
+@pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["each once", "all"])
 def test_altered_files_are_described_or_refused_in_words(
-    write: Write, frames: list[Frame], where: str, tmp_path: Path
+    write: Write, frames: list[Frame], quick: bool, tmp_path: Path
 ) -> None:
-    whole = write(frames)
-    for what, value in ALTERATIONS.items():
+    whole, each_once = write(frames), list(zip(ALTERATIONS, PLACES * 2, strict=False))
+    for what, where in each_once if quick else product(ALTERATIONS, PLACES):
+        value = ALTERATIONS[what]
         path = tmp_path / f"{what}.h5"
         shutil.copy(whole, path)
         with h5py.File(path, "r+") as file:
@@ -112,3 +121,4 @@ def test_altered_files_are_described_or_refused_in_words(
         for ask in (describe, recover, partial(ingest, out=tmp_path / f"copy of {what}.h5")):
             with suppress(DataError):
                 ask(path)
+        (tmp_path / f"copy of {what}.h5").unlink(missing_ok=True)

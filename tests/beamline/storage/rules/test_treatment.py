@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.features.files.describe import describe
+from beamline.features.files.validate import validate
 from beamline.monitor.check import Flag, Level
 from beamline.projections.corrections.flags import usable_views
-from beamline.storage.describe import describe
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.treatment import frames_flagged
-from beamline.storage.rules.validate import validate
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 2 darks, 2 flats, 18 views

@@ -15,12 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.text import spans
+from beamline.features.files.describe import describe
+from beamline.features.files.validate import source_findings, validate
 from beamline.monitor.digest import digest
-from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.rules.angles import angles_spread, half_turn_unseen
-from beamline.storage.rules.validate import change_of_rows, source_findings, validate
+from beamline.storage.rules.scan import change_of_rows
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
@@ -196,11 +197,12 @@ def test_each_rule_finds_what_it_is_for(
     with h5py.File(path, "r+") as file:
         spoil(file)
         seal(file)
-    hits = [finding for finding in validate(path) if finding.rule == rule]
-    assert hits, f"found only {found(path)}"
+    findings = validate(path)
+    hits = [finding for finding in findings if finding.rule == rule]
+    assert hits, f"found only {findings}"
     assert hits[0].severity == severity
     assert re.search(said, hits[0].message), hits[0].message
-    others = {(finding.severity, finding.rule) for finding in validate(path)} - {(severity, rule)}
+    others = {(finding.severity, finding.rule) for finding in findings} - {(severity, rule)}
     assert not {other for other in others if other[0] == "error"} or spoil is float_frames
 
 

@@ -131,14 +131,14 @@ def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     for name, said in (("bare", "name an array in it"), ("channels", "one time and one channel")):
         with pytest.raises(DataError, match=said), opened_volume(tmp_path / f"{name}.zarr"):
             pass
-    with pytest.raises(DataError, match="cannot be read as a Zarr"), opened_volume(tmp_path / "bare.zarr", "nothing"):
+    with pytest.raises(DataError, match="as a Zarr"), opened_volume(tmp_path / "bare.zarr", "nothing"):
         pass
     chunk = next(path for path in (tmp_path / "cut.zarr/s0/c").rglob("*") if path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:20])
     with opened_volume(tmp_path / "cut.zarr") as record, pytest.raises(DataError, match="cannot be read"):
         _ = record.volume.data[:]
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(DataError, match="to read it, pip install zarr"), opened_volume(tmp_path / "bare.zarr"):
+    with pytest.raises(DataError, match="pip install zarr"), opened_volume(tmp_path / "bare.zarr"):
         pass
 
 
@@ -178,5 +178,5 @@ def test_true_is_no_side_of_a_volume(tmp_path: Path, key: str) -> None:
     head = (tmp_path / "zarr.json").read_text()
     (tmp_path / "zarr.json").write_text(re.sub(rf'("{key}": \[\s*)4', r"\1true", head, count=1))
     assert (tmp_path / "zarr.json").read_text() != head
-    with pytest.raises(DataError, match=rf"its {key} is \[True, 4, 4\]; expected whole numbers"):
+    with pytest.raises(DataError, match=r"\[True, 4, 4\]"):
         open_zarr(tmp_path)

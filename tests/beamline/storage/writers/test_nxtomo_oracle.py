@@ -17,10 +17,10 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from beamline.features.files.ingest import ingest
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover

@@ -93,7 +93,7 @@ def test_a_stop_by_another_client_is_not_taken_for_done() -> None:
     stage.start_move(math.radians(20), SPEED)
     clock.sleep(1)
     record.write(".STOP", 1)
-    with pytest.raises(DeviceError, match=r"stopped short of 20.*who or what stopped it"):
+    with pytest.raises(DeviceError, match=r"stopped short of 20.*what stopped it"):
         stage.wait(60)
 
 
@@ -103,9 +103,7 @@ def test_a_controller_that_is_lost_is_never_taken_for_standing() -> None:
     stage.start_move(math.radians(20), SPEED)
     record.broken = True
     for act in (stage.moving, stage.position, lambda: stage.wait(60)):
-        with pytest.raises(
-            DeviceError, match=r"RBV has an INVALID alarm.*its own screen.*Whether it moves is not known"
-        ):
+        with pytest.raises(DeviceError, match=r"RBV.*its own screen.*is not known"):
             act()
 
 
@@ -140,7 +138,7 @@ def test_an_ioc_that_never_was_or_is_gone_is_an_error_in_time(monkeypatch: pytes
     clock = TickingClock()
     record = record_of(clock, TriggerLine(clock))
     with serve_pva(record, clock, monkeypatch) as ioc:
-        with pytest.raises(DeviceTimeout, match=r"stage: no answer within 0.3 s.*nobody\.EGU.*EPICS_PVA_ADDR_LIST"):
+        with pytest.raises(DeviceTimeout, match=r"within 0.3 s.*nobody\.EGU.*EPICS_PVA_ADDR_LIST"):
             _stage("pva://nobody", clock, timeout=0.3)
         stage = _stage(f"pva://{PREFIX}", clock, timeout=1.0)
         stage.start_move(math.radians(20), SPEED)
@@ -192,6 +190,6 @@ def test_a_disabled_record_that_takes_no_value_is_named() -> None:
     stage = _stage(url, clock)
     record.write(".DISP", 1)
     stage.start_move(math.radians(20), SPEED)
-    with pytest.raises(DeviceError, match=r"It stands at 0\.0000 deg, 0 counts: DISP is 1: the record takes no values"):
+    with pytest.raises(DeviceError, match=r"0\.0000 deg, 0 counts: DISP is 1:"):
         stage.wait(60)
     stage.close()

@@ -23,7 +23,7 @@ def rig() -> Rig:
 @pytest.mark.parametrize("lost", ["ACC 1 60", "DEC 1 60", "SVO 1 1"])
 def test_a_setting_lost_on_the_way_is_noticed_at_opening(rig: Rig, lost: str) -> None:
     rig.replace(lost)
-    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}.*Nothing has moved"):
+    with pytest.raises(DeviceError, match=f"was not taken.*{lost}.*Nothing has moved"):
         rig.open()
 
 
@@ -31,7 +31,7 @@ def test_a_setting_lost_on_the_way_is_noticed_at_opening(rig: Rig, lost: str) ->
 def test_a_command_lost_on_the_way_is_noticed_before_a_move_counts_as_begun(rig: Rig, lost: str) -> None:
     stage = rig.open()
     rig.replace(lost)
-    with pytest.raises(DeviceError, match=f"a setting was not taken.*{lost}"):
+    with pytest.raises(DeviceError, match=f"was not taken.*{lost}"):
         stage.start_move(math.radians(30), math.radians(20))
     assert not stage.moving()
     assert stage.position() == 0.0
@@ -76,7 +76,7 @@ def test_a_reference_search_lost_on_the_way_does_not_count_as_done() -> None:
     stage = rig.open()
     rig.replace("FRF 1")
     stage.start_home()
-    with pytest.raises(DeviceError, match=r"reference move stopped short \(no reason given\).*not those"):
+    with pytest.raises(DeviceError, match=r"\(no reason given\).*not those"):
         stage.wait(LONG)
 
 
@@ -84,7 +84,7 @@ def test_a_stop_that_is_not_understood_is_named(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(60), SPEED)
     rig.replace("HLT 1", "HXT 1")
-    with pytest.raises(DeviceRefused, match=r"HLT ended with error 2.*That command did nothing"):
+    with pytest.raises(DeviceRefused, match=r"HLT.*command did nothing"):
         stage.stop()
     stage.abort()
     assert not stage.moving()

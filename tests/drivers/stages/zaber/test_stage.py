@@ -137,7 +137,7 @@ def test_without_a_reference_it_does_not_move_until_it_has_searched_one() -> Non
 def test_a_move_that_ends_early_says_where_and_why(fault: str, words: str) -> None:
     stage = Rig(**{fault: 10_000}).open()
     stage.start_move(math.radians(30), SPEED)
-    with pytest.raises(DeviceError, match=rf"stopped short of 30\.0000 deg.*stands at 10\.0000 deg.*{words}") as error:
+    with pytest.raises(DeviceError, match=rf"30\.0000 deg.*stands at 10\.0000 deg.*{words}") as error:
         stage.wait(LONG)
     assert not isinstance(error.value, DeviceTimeout)
     assert "Find" in error.value.advice
@@ -148,7 +148,7 @@ def test_a_move_that_ends_early_says_where_and_why(fault: str, words: str) -> No
 def test_a_driver_that_somebody_disabled_is_named(rig: Rig) -> None:
     stage = rig.open()
     rig.say("/1 1 driver disable")
-    with pytest.raises(DeviceRefused, match=r"its driver is disabled \(DRIVERDISABLED\).*Nothing has moved"):
+    with pytest.raises(DeviceRefused, match=r"\(DRIVERDISABLED\).*Nothing has moved"):
         stage.start_move(0.1, SPEED)
 
 
@@ -229,7 +229,7 @@ def test_the_configured_serial_number_is_required(rig: Rig) -> None:
     rig.open(serial="123456").close()
     with pytest.raises(
         DeviceRefused,
-        match=r"another device answers: its serial number is 123456.*Expected 42.*swapped.*Nothing has moved",
+        match=r"another device answers.*123456.*Expected 42.*swapped.*Nothing has moved",
     ):
         rig.open(serial="42")
 
@@ -327,7 +327,7 @@ def test_a_stop_that_got_lost_is_noticed(rig: Rig) -> None:
     stage = rig.open()
     stage.start_move(math.radians(100), math.radians(1))
     rig.lose("stop")
-    with pytest.raises(DeviceTimeout, match=r"still moving .* after the stop command"):
+    with pytest.raises(DeviceTimeout, match=r"still moving .*the stop command"):
         stage.stop()
 
 

@@ -105,7 +105,7 @@ def test_trains_that_would_run_together_are_refused(made: dict[str, Any], neares
     """At 30 deg/s = 30 000 counts/s: a width and as long again of rest, or two fires 1 ms apart."""
     stage = Rig().bench(**made).stage
     stage.arm(TriggerTrain(1000, nearest, 9))
-    with pytest.raises(DeviceRefused, match=f"at full speed, which are {nearest} counts"):
+    with pytest.raises(DeviceRefused, match=f"{nearest} counts"):
         stage.arm(TriggerTrain(1000, nearest - 2, 9))
     stage.arm(TriggerTrain(1000, 1, 1))
 
@@ -118,7 +118,7 @@ def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
     assert replace(usual, wiring=Wiring(pulse_width=4e-3)).pulses.spacing == 8e-3
     toggled = replace(usual, toggle=True).pulses
     assert (toggled.width, toggled.spacing) == (None, 4e-3)
-    with pytest.raises(ValueError, match="a toggled output has no pulse width"):
+    with pytest.raises(ValueError, match="no pulse width"):
         replace(usual, toggle=True, wiring=Wiring(pulse_width=4e-3))
 
 
@@ -190,7 +190,7 @@ def test_a_toggled_output_rests_after_a_train_and_after_disarming_in_the_middle(
 def test_firmware_without_schedule_says_so_and_is_served_by_toggling() -> None:
     rig = Rig(can_schedule=False)
     bench = rig.bench()
-    with pytest.raises(DeviceRefused, match=r"cannot be set up.*schedule.*toggle.*not armed"):
+    with pytest.raises(DeviceRefused, match=r"be set up.*schedule.*toggle.*not armed"):
         bench.stage.arm(bench.train(1.0, 1.0, 3))
     bench.go(10.0)
     assert bench.pulses() == []

@@ -89,3 +89,12 @@ def test_the_gradient_is_the_slope_of_tv(shape: tuple[int, int, int], seed: int)
 def test_reference_is_a_transpose(rng: np.random.Generator) -> None:
     x, p = rng.normal(size=(4, 5, 6)), rng.normal(size=(3, 4, 5, 6))
     assert (differences(x, WEIGHTS) * p).sum() == pytest.approx((x * transposed_differences(p, WEIGHTS)).sum())
+
+
+def test_a_vanishing_weight_leaves_the_volume(rng: np.random.Generator) -> None:
+    x = rng.random((4, 5, 20), np.float32)
+    p, scratch, out = tv_cpu.dual_field(x.shape), tv_cpu.dual_scratch(x.shape), np.empty_like(x)
+    for _ in range(3):
+        tv_cpu.dual_step(x, p, 1e-25, (1.0, 1.0, 1.0), True, scratch)
+    tv_cpu.primal(x, p, 1e-25, (1.0, 1.0, 1.0), True, scratch, out)
+    np.testing.assert_array_equal(out, x)

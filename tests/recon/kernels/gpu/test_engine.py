@@ -79,13 +79,13 @@ def test_project_and_voxelize_go_where_they_are_sent(random_gaussians: Make) -> 
     np.testing.assert_allclose(shown, project(g, geometry, truncation=cut, model=model), rtol=1e-4, atol=1e-5)
     dense = voxelize(there, grid, truncation=cut, implementation="gpu").detach().cpu()
     np.testing.assert_allclose(dense, voxelize(g, grid, truncation=cut), rtol=1e-4, atol=1e-6)
-    with pytest.raises(ValueError, match="gpu implementation works in float32"):
+    with pytest.raises(ValueError, match="float32"):
         project(in_double(g), geometry, implementation="gpu")
 
 
 def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "interpreted", lambda: False)
-    with pytest.raises(ValueError, match="run on cuda devices, got cpu"):
+    with pytest.raises(ValueError, match="devices, got cpu"):
         gpu.require("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="sees no CUDA device"):
@@ -93,10 +93,10 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(ValueError, match=r"cuda:1 was asked for.*current one, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
+    with pytest.raises(ValueError, match=r"cuda:1.*current one, cuda:0.*CUDA_VISIBLE_DEVICES=1"):
         gpu.require("cuda:1")
     for absent in ("cuda:2", "cuda:200"):  # torch takes the latter for a device of negative number
-        with pytest.raises(ValueError, match=rf"{absent} was asked for, and torch sees 2 CUDA devices.*ask for cuda"):
+        with pytest.raises(ValueError, match=r"sees 2 CUDA.*ask for cuda"):
             gpu.require(absent)
     assert gpu.require("cuda:0") == torch.device("cuda:0")
 

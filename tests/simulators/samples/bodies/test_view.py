@@ -13,9 +13,9 @@ from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.polyhedra import octahedron
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
 from simulators.samples.bodies.view import view_of
-from simulators.samples.builders.grains import octahedron
 from tests.simulators.bodies import SOLIDS, TURNABLE, chords, rays, turned
 
 
@@ -122,5 +122,5 @@ def test_bodies_close_before_the_source_are_seen(solid: Solid) -> None:
 
 
 def test_a_pose_of_other_rows_is_refused() -> None:
-    with pytest.raises(ValueError, match="the pose has 7 angles and the detector 8 rows"):
+    with pytest.raises(ValueError, match="has 7 angles"):
         Phantom.of([]).line_integrals(Pose.turned(0.0, 7), Detector.centred((8, 8), 0.1))

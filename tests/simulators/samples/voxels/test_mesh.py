@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull
 from simulators.frame.mapping import SceneError
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
+from simulators.samples.sample import Stored
 from simulators.samples.voxels.mesh import filled, require_closed
-from simulators.samples.voxels.volume import Stored
 
 
 def hull_mesh(points: np.ndarray) -> np.ndarray:

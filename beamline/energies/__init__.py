@@ -1,0 +1,1 @@
+"""Scans of one sample at several energies as one source of views."""

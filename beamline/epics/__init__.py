@@ -1,1 +1,0 @@
-"""EPICS: the state of a run as process variables."""

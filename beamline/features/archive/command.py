@@ -1,0 +1,65 @@
+"""`beamline archive`: compresses a scan file, and compares the copy with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from beamline.cli.options import NameChoice, as_scan, json_option
+from beamline.cli.terminal import counting, events_shown
+from beamline.core.events import Done
+from beamline.core.files import refuse_existing
+from beamline.core.text import count, size, spans
+from beamline.storage.codecs import CODECS
+from drivers.base.clock import SystemClock
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("scan", metavar="SCAN|RUN", type=_PATH, callback=as_scan)
+@click.option("-o", "--output", metavar="FILE", type=_PATH, required=True, help="The archive to write.")
+@click.option(
+    "--codec",
+    type=NameChoice(CODECS),
+    default=CODECS[0],
+    show_default=True,
+    help="Compressor, all lossless. blosc2: zstd after a bit shuffle. bitshuffle-lz4: fast, and most widely read.",
+)
+@click.option("--keep-damaged", is_flag=True, help="Archive frames that differ from their checksum, as they are.")
+@json_option
+def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: bool) -> None:
+    """Write a compressed copy of the HDF5 scan SCAN, and compare every frame of it with SCAN.
+
+    The copy is lossless and opens like SCAN. Each frame is read back from the finished file and compared by its CRC-32.
+    SCAN is never deleted: the last line names the files that may be. Nothing is overwritten, and a failure leaves
+    nothing.
+    """
+    from beamline.features.archive.archive import archive as archive_scan
+
+    clock = SystemClock()
+    began = clock.now()
+    with events_shown(as_json) as sink:
+        refuse_existing(output)
+        progress = counting("archive", sink, clock)
+        done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=progress)
+        facts = {**vars(done), "codec": codec, "ratio": done.raw_bytes / done.bytes, "seconds": clock.now() - began}
+        sink(Done(facts, time=clock.now()))
+    if as_json:
+        return
+    click.echo(f"output   {output} ({codec})")
+    click.echo(f"size     {size(done.raw_bytes)} -> {size(done.bytes)}, ratio {facts['ratio']:.2f}")
+    click.echo(f"speed    {done.raw_bytes / max(facts['seconds'], 1e-9) / 1e6:.0f} MB/s, written and compared")
+    verified = f"verified {count(done.frames, 'frame')}, each as in {scan}"
+    if done.damaged:
+        click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept unchanged: {spans(done.damaged)}")
+        verified += f", also its {count(len(done.damaged), 'damaged frame')}"
+    if done.altered:
+        click.echo(
+            f"altered  what {scan} says of frames {spans(done.altered)} is not as it was written; kept unchanged"
+        )
+    click.echo(verified)
+    raw, *others = map(str, done.sources)
+    more = f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""
+    click.echo(f"the raw file may be deleted: {raw}{more}")

@@ -1,0 +1,383 @@
+"""Batches: many scans by one recipe, in a worker process that ends after a failure, and a table of the results."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
+
+from beamline.core.errors import DataError, QualityError
+from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned, event_of
+from beamline.core.files import RECON, named_on_failure, remove, whole_file
+from beamline.core.machine_speed import seconds_left
+from beamline.core.need import Need
+from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
+from beamline.core.text import count, size
+from beamline.storage.writer_lock import WriterLock, held
+from drivers.base.clock import Clock
+from recon.assess.time_model import duration_text
+
+RowState = Literal["waiting", "done", "poor", "failed"]
+
+TABLE, RECIPE = "batch.csv", "recipe.yaml"
+_WORKER_LOG = ".worker.txt"
+_WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
+COMMAND = (sys.executable, "-m", "beamline.features.batch.recon_worker")
+"""The worker, which reconstructs scan after scan: libraries are loaded and kernels compiled once."""
+_POLL = 0.2  # real s between two checks of the worker
+_SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
+
+
+@dataclass(frozen=True)
+class BatchRow:
+    """A scan of a batch.
+
+    Attributes:
+        name: of its folder of results, inside the batch's.
+        state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
+            one; "waiting": not tried yet.
+        residual: of the volume, of views held out where there were any.
+        message: why it failed, or is poor.
+    """
+
+    name: str
+    scan: str
+    state: RowState = "waiting"
+    seconds: float | None = None
+    method: str = ""
+    residual: float | None = None
+    message: str = ""
+
+    @property
+    def has_volume(self) -> bool:
+        return self.state in ("done", "poor")
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """What to reconstruct, how and where.
+
+    Attributes:
+        recipe: file with the options of `beamline recon`; None: its defaults.
+        folder: of the results, new or of an earlier call with the same recipe.
+    """
+
+    scans: Sequence[Path]
+    recipe: Path | None
+    folder: Path
+
+
+def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]:
+    """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
+
+    A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
+    is tried again by the next call. Ctrl-C ends the scan under way, which leaves nothing; the others stay.
+
+    Returns:
+        All rows of the table, also those of earlier calls.
+
+    Raises:
+        DataError: the folder is not that of a batch, or of one with another recipe; nothing was touched.
+        KeyboardInterrupt: stopped; the table has the scans that were done.
+    """
+    folder = options.folder
+    _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+    if held(folder / RECIPE):
+        raise DataError(f"Another batch works in {folder}. Wait for its end, or name another folder.")
+    lock = WriterLock(folder / RECIPE)
+    try:
+        with Worker(folder / _WORKER_LOG) as worker:
+            return _run_all(options, worker, sink, clock)
+    finally:
+        lock.release()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanNeed(Need):
+    """What the reconstruction of a scan will take; `refusal`: why it would fail, empty where it would not."""
+
+    refusal: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchPlan(Need):
+    """What a call would do, and what all scans that wait will take.
+
+    Attributes:
+        rows: all rows of the table, with those of this call.
+        needs: of each scan that waits, by its row's name.
+    """
+
+    folder: Path
+    rows: Sequence[BatchRow]
+    needs: Mapping[str, ScanNeed]
+
+    def lines(self) -> list[str]:
+        """For people."""
+        width = max((len(row.name) for row in self.rows), default=4)
+        rows = [f"{row.name:<{width}}  {row.state:<8}{self._time_of(row):<12}{row.scan}" for row in self.rows]
+        refused = [f"{name}: {needs.refusal}" for name, needs in self.needs.items() if needs.refusal]
+        unknown = sum(needs.seconds is None and not needs.refusal for needs in self.needs.values())
+        time = f"about {duration_text(self.seconds or 0.0)} at most, reading and correction not counted"
+        time += f", beside {count(unknown, 'scan')} whose time is not known" if unknown else ""
+        fails = f"; {len(refused)} of them would fail" if refused else ""
+        return [
+            *rows,
+            "",
+            *([*refused, ""] if refused else []),
+            f"{'scans':<10}{len(self.rows)}; {len(self.needs)} to be reconstructed{fails}",
+            f"{'time':<10}{time if self.needs else 'none: every scan has a volume'}",
+            f"{'memory':<10}{size(self.memory or 0)} for the largest",
+            f"{'disk':<10}{size(self.disk)}",
+            f"{'output':<10}{self.folder}: {TABLE}, and a folder a scan (not written now)",
+        ]
+
+    def _time_of(self, row: BatchRow) -> str:
+        needs = self.needs.get(row.name)
+        return "" if needs is None or needs.seconds is None else duration_text(needs.seconds)
+
+
+def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) -> BatchPlan:
+    """What `run_batch` would do. Nothing is written, and no frame is read.
+
+    Args:
+        needs_of: what the reconstruction of a scan file by the recipe takes.
+
+    Raises:
+        DataError: as `run_batch`, which would refuse the folder.
+    """
+    folder, earlier = options.folder, list[BatchRow]()
+    if folder.exists():
+        _refuse_other(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+        earlier = _read(folder)
+    rows = _rows(options.scans, earlier)
+    needs = {row.name: needs_of(row.scan) for row in rows if not row.has_volume}
+    return BatchPlan(folder=folder, rows=rows, needs=needs, **vars(Need.in_turn(needs.values())))
+
+
+class Worker:
+    """A process that reconstructs one scan after the other; a context manager, which ends it.
+
+    After a scan without a volume the next one gets a new process, so that a crash, a lack of memory or leftovers of a
+    failure harm no other scan.
+
+    Args:
+        log: file for its stderr while it works on a scan.
+        silence: real s without a line, after which a scan is taken to hang.
+    """
+
+    def __init__(self, log: Path, command: Sequence[str] = COMMAND, silence: float = _SILENCE) -> None:
+        self._log, self._command, self._silence = log, command, silence
+        self._running = ExitStack()
+        self._process: ChildProcess | None = None
+        self._on_line: Callable[[str], None] = lambda line: None
+        self._heard, self._code, self._ended = 0.0, 0, threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def run(self, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int | None, str]:
+        """The exit code of `beamline` with these arguments, and the last line of its stderr."""
+        self._on_line = on_line
+        process = self._process or self._start()
+        self._ended.clear()
+        before = self._log.stat().st_size
+        self._heard = time.monotonic()
+        with suppress(OSError):  # it has ended since
+            process.tell(json.dumps(list(arguments)))
+        silent = False
+        while process.running and not silent and not self._ended.wait(_POLL):
+            silent = time.monotonic() - self._heard > self._silence
+        if not process.running:
+            process.wait()  # for its last lines
+        reason = last_line(self._log, before)
+        if self._ended.is_set():
+            code: int | None = self._code
+        else:
+            code = None if silent else process.code
+            reason = f"it hung: no word from it for {self._silence:g} s" if silent else reason
+        if code not in _WITH_VOLUME:
+            self.end()
+        return code, reason
+
+    def _start(self) -> ChildProcess:
+        stderr = self._running.enter_context(self._log.open("w", encoding="utf-8"))
+        started = ChildProcess(self._command, stderr, self._take, with_our_path(), tether=True)
+        self._process = self._running.enter_context(started)
+        return self._process
+
+    def end(self) -> None:
+        """End the process; the next scan gets another one."""
+        self._running.close()
+        self._process = None
+        self._log.unlink(missing_ok=True)
+
+    def _take(self, line: str) -> None:
+        self._heard = time.monotonic()
+        data = json_object(line) or {}
+        if data.get("event") == "ended":
+            self._code = int(data["exit_code"])
+            self._ended.set()
+        else:
+            self._on_line(line)
+
+
+def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> list[BatchRow]:
+    folder = options.folder
+    rows = _rows(options.scans, _read(folder))
+    _write(folder, rows)
+    start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
+    for tried, n in enumerate(waiting):
+        spent = clock.now() - start
+        eta = seconds_left(tried, len(waiting), spent)
+        rate = 60 * tried / max(spent, 1e-9)
+        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
+        rows[n] = _one(rows[n], options, worker, sink, clock)
+        _write(folder, rows)
+        row = rows[n]
+        sentence = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
+        now = clock.now()
+        sink(StateEntered("batch", sentence, time=now) if row.has_volume else Warned(sentence, "batch", time=now))
+    return rows
+
+
+def names_of(scans: Sequence[Path]) -> list[str]:
+    """A name for each file: its stem, with as many of its folders as make it unique."""
+    parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
+    names = [own[-1] for own in parts]
+    for depth in range(2, max(map(len, parts), default=0) + 1):
+        shared = _shared(names)
+        names = [
+            "_".join(own[-depth:]) if is_shared else name
+            for own, name, is_shared in zip(parts, names, shared, strict=True)
+        ]
+    return [
+        f"{name}_{n}" if is_shared else name
+        for n, (name, is_shared) in enumerate(zip(names, _shared(names), strict=True))
+    ]
+
+
+def _shared(names: Sequence[str]) -> list[bool]:
+    """Whether each name is also another's, if upper and lower case are equal."""
+    folded = [name.casefold() for name in names]
+    return [folded.count(name) > 1 for name in folded]
+
+
+def _begin(folder: Path, recipe: bytes) -> None:
+    """Make the folder, or check that it belongs to this recipe."""
+    if folder.exists():
+        _refuse_other(folder, recipe)
+        return
+    with whole_file(folder) as partial:
+        partial.mkdir()
+        (partial / RECIPE).write_bytes(recipe)
+        _write(partial, [])
+
+
+def _refuse_other(folder: Path, recipe: bytes) -> None:
+    """Raises DataError for a folder that is not that of a batch by this recipe."""
+    kept = folder / RECIPE
+    if not (folder / TABLE).is_file():
+        raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
+    if not kept.is_file() or kept.read_bytes() != recipe:
+        raise DataError(
+            f"{folder} holds results of another recipe, {kept}. Give that one as --config, or name another folder. "
+            "Nothing was touched."
+        )
+
+
+def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
+    """The earlier rows, and one for each scan that is new."""
+    old = {row.scan for row in earlier}
+    new = [path for path in scans if str(path.resolve()) not in old]
+    names = names_of([*(Path(row.scan) for row in earlier), *new])[len(earlier) :]
+    taken = {row.name.casefold() for row in earlier}
+    free = [f"{name}_{len(earlier) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
+    return [*earlier, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
+
+
+def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> BatchRow:
+    """Reconstruct a scan."""
+    began, last = clock.now(), dict[str, Any]()
+
+    def pass_on(line: str) -> None:
+        nonlocal last
+        try:
+            event = event_of(json_object(line) or {})
+        except ValueError:
+            return
+        if isinstance(event, Done | Failed):
+            last = event.data
+        else:
+            sink(replace(event, scan=row.scan))
+
+    place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
+    if (place / RECON).is_file():
+        return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
+    remove(work)  # of a batch that was killed
+    try:
+        with named_on_failure(work):
+            work.mkdir()
+        code, stderr = worker.run(_arguments(options, row.scan, work), pass_on)
+        state = _WITH_VOLUME.get(code, "failed") if (work / RECON).is_file() else "failed"
+        if state != "failed":
+            with named_on_failure(place):
+                work.replace(place)
+    except BaseException:
+        worker.end()  # before its files are removed
+        raise
+    finally:
+        remove(work)
+    residual = last.get("residual_held_out", last.get("residual"))
+    reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
+    message = "" if state == "done" else reason or f"no volume: its process ended with code {code}"
+    return replace(
+        row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
+        message=message,
+    )  # fmt: skip
+
+
+def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
+    recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
+    return ["recon", scan, *recipe, "--output", str(work / RECON), "--log", str(work / "log.txt"), "--json"]
+
+
+def _read(folder: Path) -> list[BatchRow]:
+    """The table of an earlier call.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    path = folder / TABLE
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [_row(record) for record in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise DataError(f"{path} is no table of a batch ({error}). Nothing was touched.") from error
+
+
+def _row(record: Mapping[str, str]) -> BatchRow:
+    results: Mapping[str, RowState] = {result: result for result in get_args(RowState)}
+    numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
+    return BatchRow(
+        record["name"], record["scan"], results[record["state"]], method=record["method"], message=record["message"],
+        **numbers,
+    )  # fmt: skip
+
+
+def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
+    path = folder / TABLE
+    with whole_file(path, replace=True) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, [column.name for column in fields(BatchRow)])
+        table.writeheader()
+        table.writerows(asdict(row) for row in rows)

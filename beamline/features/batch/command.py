@@ -1,0 +1,101 @@
+"""`beamline batch`: reconstructs many scans by one recipe, and keeps a table of them."""
+
+from __future__ import annotations
+
+import io
+import json
+from contextlib import redirect_stdout
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import click
+
+from beamline.cli.options import dry_option, json_events, json_option
+from beamline.cli.terminal import events_shown
+from beamline.core.errors import BeamlineError, DataError, ScanStopped
+from beamline.core.events import Done
+from beamline.core.files import RECON
+from beamline.core.need import Need
+from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
+from drivers.base.clock import SystemClock
+
+
+def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
+    """The files that names and patterns mean, each once, in the order of the names."""
+    from beamline.storage.interrupted import scan_file  # here: help needs none of it
+
+    scans: dict[Path, None] = {}
+    for name in value:
+        path, root = Path(name), Path(Path(name).anchor)
+        matches = [path] if path.exists() else sorted(root.glob(str(path.relative_to(root))))
+        if not matches:
+            raise click.BadParameter(f"{name!r} is no file, and no pattern that any file matches")
+        scans.update((scan_file(match.resolve()), None) for match in matches)
+    return list(scans)
+
+
+def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
+    """What `beamline recon SCAN --dry-run` says of an output on the disk of the folder `beside`."""
+    from beamline.cli.recon import recon  # the batch itself needs none of it
+
+    recipe, lines = [] if config is None else ["--config", str(config)], io.StringIO()
+    try:
+        with TemporaryDirectory(prefix=".beamline-", dir=beside) as work, redirect_stdout(lines):
+            arguments = [scan, *recipe, "--output", str(Path(work) / RECON), "--dry-run", "--json"]
+            recon.main(arguments, prog_name="beamline recon", standalone_mode=False)
+    except (BeamlineError, click.ClickException) as error:
+        return ScanNeed(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
+    told = json.loads(lines.getvalue().splitlines()[-1])
+    return ScanNeed(**{each.name: told[each.name] for each in fields(Need) if each.name in told})
+
+
+@click.command()
+@click.argument("scans", nargs=-1, required=True, callback=scans_of)
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Recipe of the reconstructions, such as `beamline recon ... --write-config` writes. Default: -m auto.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder of the results: new, or that of an earlier call with the same recipe, which is continued.",
+)
+@dry_option
+@json_option
+def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_json: bool) -> None:
+    """Reconstruct all SCANS, files or patterns such as "runs/*/scan.h5", one after the other, by one recipe.
+
+    Each scan gets a folder in --output with its volume, report and log; batch.csv says what became of it, and why it
+    failed. Called again, only scans without a volume are reconstructed. Ctrl-C keeps the scans that are done (exit
+    code 4). Exit code 5: a scan failed.
+    """
+    if config is not None:
+        from beamline.cli.recon import refuse_recipe  # here: help needs none of it
+
+        refuse_recipe(config)
+    options, clock = BatchOptions(scans, config, output), SystemClock()
+    if dry:
+        beside = next(folder for folder in output.absolute().parents if folder.is_dir())
+        planned = planned_batch(options, partial(_needs_of, config, beside))
+        with json_events(as_json) as sink:
+            sink(Done(planned, time=clock.now()))
+        if not as_json:
+            click.echo("\n".join(planned.lines()))
+        return
+    with events_shown(as_json) as sink:
+        try:
+            rows = run_batch(options, sink, clock)
+        except KeyboardInterrupt as stop:
+            raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
+        failed = [row for row in rows if not row.has_volume]
+        counts = {"done": len(rows) - len(failed), "failed": len(failed), "output": output / TABLE}
+        sink(Done(counts, time=clock.now()))
+    if failed:
+        raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
+    if not as_json:
+        click.echo(f"{len(rows)} of {len(rows)} scans have a volume: {output / TABLE}")

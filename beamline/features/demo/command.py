@@ -1,0 +1,215 @@
+"""`beamline demo`: a simulated scan from trigger to volume and report, in about a minute."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.options import POSITIVE, json_events, json_option
+from beamline.cli.terminal import Terminal, results
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
+from beamline.core.narration import sentence
+from beamline.core.process import ChildProcess
+from beamline.core.sinks import fan_out
+from beamline.core.stop import StopRequest, stop_signals
+from drivers.base.clock import Clock, SystemClock
+
+if TYPE_CHECKING:
+    from beamline.config.load import Config
+    from recon.base.volume import Grid, Volume
+
+
+@click.command()
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the folders of runs. Default: storage.folder of configs/demo.yaml.",
+)
+@click.option("--seconds", type=POSITIVE, help="Time of the fit after the scan; a longer fit gives a better volume.")
+@json_option
+def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
+    """Scan a simulated battery, reconstruct it during the scan, and compare the volume with the truth.
+
+    The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
+    """
+    _keep_bytecode()
+    from beamline.config.load import config_folder, load
+
+    overrides = () if seconds is None else (f"recon.seconds={seconds}",)
+    with json_events(as_json) as json_sink:
+        config = load(config_folder() / "demo.yaml", overrides)
+        stop = StopRequest()
+        last: list[Event] = []
+        with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
+            run_demo(config, output, [terminal, last.append, json_sink], stop, shlex.join(["beamline", *sys.argv[1:]]))
+    if not as_json:
+        done = last[-1]
+        assert isinstance(done, VolumeDone)
+        click.echo(f"{'folder':<10}{done.record.output.parent}\n{results(done.record)}")
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """A process of low priority that compiles the last kernels of the fit: once on a machine."""
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
+        words = [sys.executable, "-c", "from recon.warm_up import warm_up_rest; warm_up_rest()"]
+        with ChildProcess(words, nowhere, lambda line: None, behind=True):
+            yield
+
+
+def _keep_bytecode() -> None:
+    """Write the bytecode of what is imported, also where the environment asks for none: README installs without it.
+
+    Else each later command would compile torch and scipy again, in 4 s.
+    """
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
+
+
+def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:
+    """Scan with a live reconstruction, then compare its volume and the FBP of the same views with the truth.
+
+    The event `done` is the last one.
+
+    Args:
+        config: of simulated devices.
+        runs: the folder in which the run gets its own; the configured one unless given.
+        sinks: besides the run's own.
+        stop: to end it early.
+        command: the command line, for the record.
+
+    Raises:
+        ConfigError: for a real instrument, where there is no truth.
+        DataError: the live reconstruction failed; the scan is in its file.
+    """
+    from beamline.instrument.connect import connect
+    from beamline.scan.live_process import follow_command
+    from beamline.scan.run import run_scan
+    from beamline.scan.run_folder import RECON, RECON_LOG
+
+    clock = SystemClock()
+    started = clock.now()
+    snapshots = _Snapshots()
+    outside = fan_out(*sinks)
+
+    follow = follow_command(config)
+
+    def without_report(scan: Path, output: Path) -> Sequence[str]:
+        return [*follow(scan, output), "--no-report"]  # ours replaces it
+
+    def all_but_done(event: Event) -> None:
+        if isinstance(event, ScanDone):
+            ahead.start()
+        if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
+            outside(event)
+
+    with connect(config) as instrument:
+        if instrument.truth is None:
+            raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
+        truth = instrument.truth
+        ahead = threading.Thread(target=_look_ahead, args=(truth,), name="look ahead", daemon=True)
+        result = run_scan(config, runs, [snapshots, all_but_done], stop, live=without_report, instrument=instrument)
+    folder = result.path.parent
+    if result.recon is None:
+        raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
+    shown = _Shown(command, config.recon.seed, config.recon.method, started, snapshots)
+    _compare(result.path, folder / RECON, truth, shown, outside, clock)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the page of the demonstration states beside the scan and its volume."""
+
+    command: str
+    seed: int
+    method: str
+    started: float
+    snapshots: _Snapshots
+
+
+def _compare(
+    scan: Path, volume: Path, truth: Callable[[Grid], Volume], shown: _Shown, sink: Sink, clock: Clock
+) -> None:
+    """Compare the live volume and FBP of the same views with the truth, on a page that replaces the volume's."""
+    from beamline.gaussians.model import read_model
+    from beamline.projections.prepare import prepare_projections
+    from beamline.projections.selection import Selection
+    from beamline.reconstruct.outcome import ReportContext, facts_of
+    from beamline.reconstruct.output_paths import OutputPaths, report_beside
+    from beamline.reconstruct.result import axis_of, write_result
+    from beamline.report.record import history_from
+    from beamline.storage.readers.open import open_scan
+    from beamline.storage.writers.recon_file import read_reconstruction
+    from recon.assess.metrics import psnr
+    from recon.base.method import Reconstruction
+    from recon.base.volume import Grid, Volume
+
+    record = read_reconstruction(volume)
+    warnings: list[str] = []
+    with open_scan(scan) as source:
+        facts = facts_of(source)
+        selection = Selection(axis_col=float(str(record.parameters["axis_col"])))
+        prepared = replace(prepare_projections(source, selection, warnings.append), axis=axis_of(record.parameters))
+    grid = Grid.matching(prepared.geometry)
+    ideal = truth(grid)
+    made = Reconstruction(
+        volume=Volume(record.volume.data, grid),
+        method=shown.method,
+        seconds=record.metrics["seconds"],
+        history=history_from(record.history),
+        settings=record.parameters,
+        gaussians=read_model(volume).gaussians if record.model else None,
+    )
+    target = OutputPaths(volume, report_beside(volume), replace=True)
+    if target.live_picture.exists():
+        facts = replace(facts, live_picture=target.live_picture.name)
+    curve = [(seconds, psnr(ideal.data, grown.data)) for seconds, grown in shown.snapshots.volumes]
+    context = ReportContext(
+        facts, selection, shown.command, shown.seed, warnings, shown.started,
+        scan_flags=shown.snapshots.flags, psnr=curve,
+    )  # fmt: skip
+    write_result(made, prepared, ideal, target, context, sink, clock)
+
+
+def _look_ahead(truth: Callable[[Grid], Volume]) -> None:
+    """Import and compile what the comparison needs, while the live reconstruction ends: the scan's process is idle."""
+    with suppress(Exception):  # the comparison meets it again, and says it
+        from recon.base.volume import Grid
+
+        import_module("beamline.reconstruct.result")
+
+        truth(Grid((2, 2, 2), 1.0))
+
+
+class _Snapshots:
+    """A sink that collects snapshots, which are compared with the truth after the scan, and the texts of flags."""
+
+    def __init__(self) -> None:
+        self.volumes: list[tuple[float, Volume]] = []
+        self.flags: list[str] = []
+
+    def __call__(self, event: Event) -> None:
+        from beamline.storage.writers.recon_file import read_reconstruction
+
+        if isinstance(event, SnapshotWritten):
+            try:
+                volume = read_reconstruction(Path(event.path)).volume
+            except DataError:
+                return  # the run is over and it is gone
+            self.volumes.append((event.seconds, volume))
+        elif isinstance(event, FrameFlagged | Warned):
+            text = sentence(event)
+            if text and text not in self.flags:
+                self.flags.append(text)

@@ -1,0 +1,250 @@
+"""`beamline export`: copies a volume to another format, slice by slice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.options import (
+    FiniteRange,
+    NameChoice,
+    dataset_option,
+    json_events,
+    json_option,
+    parsed,
+    refuse_contradictions,
+    refuse_shared,
+    set_by,
+    volume_path,
+    with_request,
+)
+from beamline.cli.recipe import Repeatable, names_given
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Done
+from beamline.core.files import refuse_existing
+from beamline.core.stop import terminated_like_interrupted
+from beamline.core.text import count, size
+from beamline.features.export.film import AXES, SUFFIXES, VIEWS, export_film
+from beamline.storage.volumes.registry import suffixes_text
+from drivers.base.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.storage.recon_record import ReconRecord
+
+
+def window_of(text: str) -> tuple[float, float]:
+    """LOW:HIGH, two finite numbers. ValueError for anything else."""
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ValueError(f"{text!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+    return low, high
+
+
+_PLY, _CSV = ".ply", ".csv"
+_SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
+
+
+def _output_path(text: str) -> Path:
+    return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV, *SUFFIXES) else volume_path(text)
+
+
+@dataclass(frozen=True, eq=False)
+class ExportRequest:
+    """What `beamline export` is asked for."""
+
+    volume: Path = set_by(click.argument("volume", metavar="VOLUME|RUN|SCAN", type=click.Path(path_type=Path)))
+    output: Path = set_by(
+        "-o",
+        "--output",
+        metavar="PATH",
+        callback=parsed(_output_path),
+        required=True,
+        help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv, with --film "
+        ".gif or .mp4.",
+    )
+    bits: str = set_by(
+        "--bits", type=NameChoice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values."
+    )
+    window: tuple[float, float] | None = set_by(
+        "--window",
+        metavar="LOW:HIGH",
+        callback=parsed(window_of),
+        help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped. Of "
+        "--film: those that become black and white; default: by 99.8 % of the values of some images.",
+    )
+    film: str | None = set_by(
+        "--film",
+        type=NameChoice([*AXES, VIEWS]),
+        excludes={"bits": "its images have 8 bits", **dict.fromkeys(("gaussians", "poses"), "give one of them")},
+        help="A film of the slices along an axis, or of the views of a SCAN by angle. An .mp4 needs ffmpeg.",
+    )
+    fps: float = set_by(
+        "--fps", type=FiniteRange(0.1, 100), default=20.0, show_default=True, needs=("film", "is of --film."),
+        help="Of a film: images a second. A .gif takes the nearest that it can state: 50, 33.3, 25, 20 ...",
+    )  # fmt: skip
+    side: int = set_by(
+        "--side", type=click.IntRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
+        help="Of a film: pixels of an image's longer side, at most; pixels are averaged, never enlarged.",
+    )  # fmt: skip
+    gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
+    poses: bool = set_by(
+        "--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads."
+    )
+    at: int | None = set_by(
+        "--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
+    )
+    dataset: str | None = set_by(dataset_option)
+    as_json: bool = set_by(json_option)
+
+
+@click.command(cls=Repeatable)
+@with_request(ExportRequest)
+def export(request: ExportRequest) -> None:
+    """Copy VOLUME to another format, or show it, or the views of SCAN, as a film.
+
+    Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
+    Nothing is overwritten, and a failure leaves nothing.
+    """
+    from beamline.storage.interrupted import scan_file, volume_file
+
+    context = click.get_current_context()
+    refuse_contradictions(context.command, names_given(context))
+    file = (scan_file if request.film == VIEWS else volume_file)(request.volume)
+    request = replace(request, volume=file)
+    refuse_shared({"VOLUME": request.volume, "--output": request.output})
+    if (request.output.suffix.lower() in SUFFIXES) != (request.film is not None):
+        raise click.UsageError(
+            f"-o {request.output}: --film goes with the suffixes {' and '.join(SUFFIXES)}, and voxels with others."
+        )
+    if request.film is not None:
+        _export_film(request)
+    elif (part := _part_asked_for(request)) is not None:
+        part(request.volume, request.output, request.as_json)
+    else:
+        _export_voxels(request)
+
+
+def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None] | None:
+    """What exports the part of the volume's file that --gaussians or --poses name; None: its voxels are asked for."""
+    parts = {
+        "--gaussians": (request.gaussians, _PLY, _export_gaussians),
+        "--poses": (request.poses, _CSV, _export_poses),
+    }
+    for name, (wanted, suffix, _) in parts.items():
+        if (request.output.suffix.lower() == suffix) != wanted:
+            raise click.UsageError(
+                f"-o {request.output}: {name} goes with the suffix {suffix}, and voxels with another."
+            )
+    for name, (wanted, _, export_part) in parts.items():
+        if wanted:
+            if request.bits != "32" or any(x is not None for x in (request.window, request.dataset, request.at)):
+                raise click.UsageError(f"{name} does not go with --bits, --window, --at or --dataset.")
+            return export_part
+    return None
+
+
+def _export_voxels(request: ExportRequest) -> None:
+    from beamline.storage.volumes.base import Pixels
+    from beamline.storage.volumes.files import format_of, opened_volume, write_volume
+
+    if request.dataset is not None and request.at is not None:
+        raise click.UsageError("--at does not go with --dataset: a series in time has one array.")
+    pixels = Pixels(int(request.bits), request.window)
+    if pixels.bits == 32 and request.window is not None:
+        raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
+    if pixels.bits < 32 and not format_of(request.output).greys:
+        raise click.UsageError(
+            f"{format_of(request.output).name} holds the values themselves: leave out --bits and --window."
+        )
+    clock = SystemClock()
+    began = clock.now()
+    with terminated_like_interrupted(), json_events(request.as_json) as sink:
+        refuse_existing(request.output)
+        with opened_volume(request.volume, request.dataset, request.at) as record:
+            if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
+                raise DataError(
+                    f"{request.volume} holds grey values of a window, not the volume itself. Export the volume it was "
+                    "made of."
+                )
+            if pixels.bits < 32 and request.window is None:
+                raise ConfigError(f"--bits {request.bits} needs --window LOW:HIGH. {_suggestion(record)}")
+            clipped = write_volume(request.output, record, pixels)
+            shape = record.volume.grid.shape
+        seconds = clock.now() - began
+        share = clipped / math.prod(shape)
+        facts = {
+            "output": request.output,
+            "shape": shape,
+            "bits": pixels.bits,
+            "window": request.window,
+            "clipped": share,
+        }
+        sink(Done({**facts, "seconds": seconds}, time=clock.now()))
+    if request.as_json:
+        return
+    click.echo(f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})")
+    click.echo(f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}")
+    if request.window is not None:
+        low, high = request.window
+        click.echo(f"window   {low:g} to {high:g}; {share:.3%} of the voxels lie outside and are clipped")
+
+
+def _export_film(request: ExportRequest) -> None:
+    from beamline.features.export.film_file import FilmStyle
+
+    style = FilmStyle(request.side, request.fps, request.window)
+    export_film(
+        request.film or VIEWS, request.volume, request.output, style, (request.dataset, request.at), request.as_json
+    )
+
+
+def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
+    from beamline.features.export.ply import write_ply
+    from beamline.gaussians.model import read_model
+
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        refuse_existing(output)
+        model = read_model(volume)
+        write_ply(output, model)
+        sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
+    if not as_json:
+        click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
+
+
+def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
+    from beamline.storage.pose_table import write_poses
+
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        refuse_existing(output)
+        views, axis_col = write_poses(output, volume)
+        sink(Done({"output": output, "views": views, "axis_col": axis_col}, time=SystemClock().now()))
+    if not as_json:
+        click.echo(f"output  {output} (CSV)\nviews   {views}\naxis    give --axis {axis_col:.2f} with these --poses")
+
+
+def _suggestion(record: ReconRecord) -> str:
+    """A window for the volume, by some of its slices."""
+    import numpy as np
+
+    depth = record.volume.grid.shape[0]
+    chosen = np.unique(np.linspace(0, depth - 1, min(depth, _SLICES)).astype(int))
+    some = [np.ravel(np.asarray(record.volume.data[z : z + 1], np.float32)) for z in chosen.tolist()]
+    values = np.concatenate([values[:: max(1, values.size // _VALUES)] for values in some])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return "No value of the slices looked at is finite. Nothing was written."
+    low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
+    if low < high:
+        return f"99.8 % of the values of {count(chosen.size, 'slice')} lie in {low:g}:{high:g}. Nothing was written."
+    lowest, highest = float(values.min()), float(values.max())
+    if lowest < highest:  # matter in a few voxels, or values that differ in their last digits
+        return f"The values of {count(chosen.size, 'slice')} lie in {lowest:.8g}:{highest:.8g}. Nothing was written."
+    return f"Every value of the slices looked at is {lowest:g}: there is no window to take. Nothing was written."

@@ -1,0 +1,240 @@
+"""`beamline info`, `validate`, `ingest`: describe, check and copy scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
+from beamline.cli.scan_options import light_asked, light_options, scan_options
+from beamline.cli.terminal import counting, events_shown
+from beamline.core.errors import DataError
+from beamline.core.events import Done, RuleBroken
+from beamline.core.files import refuse_existing
+from beamline.core.text import count, printable
+from drivers.base.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.projections.returned import ReturnedView
+    from beamline.projections.scan_statistics import LightAsked
+    from beamline.storage.readers.open import SourceOptions
+
+_PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@scan_argument
+@scan_options
+@click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
+@click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
+@light_options
+@click.option("--truth", metavar="FILE", help="Of a volume: PSNR and SSIM against this one (FILE or FILE:first:end).")
+@click.option("--masks", metavar="FILE", type=_PATH, help="Of a volume: SNR and CNR by labels, 1 dense and 2 empty.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
+def info(
+    file: Path,
+    statistics: bool,
+    output: Path | None,
+    truth: str | None,
+    masks: Path | None,
+    as_json: bool,
+    photons_per_count: float | None,
+    dose_in: str | None,
+    **scan_facts: Any,
+) -> None:
+    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format.
+
+    --statistics looks at up to 64 darks, flats and views each, spread over the scan, before any correction. --masks
+    takes regions that somebody has drawn, such as a TIFF of labels. "SSIM whole slices" has means and variances of
+    whole slices, without windows; "SSIM 3D" is that of reports.
+    """
+    from beamline.features.files.describe import describe
+    from beamline.storage.flag_legend import counted
+    from beamline.storage.readers.open import SourceOptions
+
+    light = light_asked(photons_per_count, dose_in)
+    if (output is not None or light is not None) and not statistics:
+        raise click.UsageError("-o and --photons-per-count go with --statistics.")
+    if statistics and (truth or masks):
+        raise click.UsageError("--statistics is of a scan, --truth and --masks are of a volume: give one of them.")
+    if statistics:
+        _print_statistics(SourceOptions(file, **scan_facts), output, light, as_json)
+        return
+    if truth or masks:
+        _print_measured(file, truth, masks, as_json)
+        return
+    with json_events(as_json) as sink:
+        facts = dict(describe(SourceOptions(file, **scan_facts)))
+        returned = _returned(SourceOptions(file, **scan_facts)) if "alignment" in facts.get("kinds", {}) else []
+        if returned:
+            facts["returned"] = [vars(view) for view in returned]
+        sink(Done(facts, time=SystemClock().now()))
+    if as_json:
+        return
+    attributes, findings = facts.pop("attributes"), facts.pop("findings")
+    facts.pop("returned", None)
+    attributes = {**attributes, **facts.pop("not_used", {})}
+    if facts.get("flags") is not None:
+        facts["flags"] = counted(facts["flags"])
+    width = max(len(name) for name in (*facts, *attributes)) + 2
+    for name, value in (facts | attributes).items():
+        click.echo(f"{name:<{width}}{_text(value)}")
+    for view in returned:
+        click.echo(f"{'on the way back':<{width}}{view.in_words()}")
+    for message in findings:
+        click.echo(f"! {message}")
+
+
+def _returned(scan: SourceOptions) -> list[ReturnedView]:
+    from beamline.features.files.describe import LOOK
+    from beamline.projections.returned import returned_views
+    from beamline.storage.readers.base import LookedEnoughError
+    from beamline.storage.readers.open import open_scan
+    from beamline.storage.readers.wrapped import BriefSource
+
+    until = SystemClock().now() + LOOK
+    with suppress(LookedEnoughError), open_scan(scan) as source:
+        return returned_views(BriefSource(source, lambda: SystemClock().now() > until))
+    return []
+
+
+def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:
+    from beamline.core.files import write_whole
+    from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
+    from beamline.storage.readers.open import open_scan
+
+    clock = SystemClock()
+    with events_shown(as_json) as sink:
+        if output is not None:
+            refuse_existing(output)
+        with open_scan(scan) as source:
+            if light is not None:
+                light.refuse_impossible(source)
+            statistics = statistics_of(source, counting("statistics", sink, clock))
+            dose = [] if light is None else light_of(source, statistics, light).in_words()
+        rows = table(statistics)
+        if output is not None:
+            write_whole(output, histograms(statistics))
+        facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
+        sink(Done({**facts, "light": dose, "output": output}, time=clock.now()))
+    if as_json:
+        return
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        click.echo("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)))
+    for line in dose:
+        click.echo(f"light   {line}")
+    if output is not None:
+        click.echo(f"output  {output}")
+
+
+def _print_measured(file: Path, truth: str | None, masks: Path | None, as_json: bool) -> None:
+    from beamline.reconstruct.measure import measured_file
+    from beamline.report.metrics import METRICS, formatted
+
+    with json_events(as_json) as sink:
+        values = measured_file(file, truth, masks)
+        sink(Done(values, time=SystemClock().now()))
+    if not as_json:
+        for name, value in values.items():
+            click.echo(f"{METRICS[name].label:<20}{formatted(name, value)}")
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "not known"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{n} {name}" for name, n in value.items())
+    if isinstance(value, tuple | list):
+        return " x ".join(str(v) for v in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = printable("; ".join(str(value).splitlines()))
+    return text if len(text) <= 160 else text[:157] + "..."
+
+
+@click.command()
+@scan_argument
+@scan_options
+@click.option("--deep", is_flag=True, help="Read every frame, and compare it with the checksum written with it.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON event per finding to stdout, then the counts.")
+def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
+    """Check the scan or volume in FILE against the rules of its format.
+
+    Exit code: 0 no error (warnings may be), 5 errors.
+    """
+    from beamline.features.files.validate import validate as findings_of
+    from beamline.storage.readers.open import SourceOptions
+
+    clock = SystemClock()
+    with events_shown(as_json) as sink:
+        progress = counting("validate", sink, clock)
+        findings, now = findings_of(SourceOptions(file, **scan_facts), progress if deep else None), clock.now()
+        counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
+        for finding in findings:
+            sink(RuleBroken(**vars(finding), time=now))
+        sink(Done({"file": file, **counts}, time=now))
+    errors = count(counts["error"], "error")
+    if not as_json:
+        for finding in findings:
+            click.echo(f"{finding.severity:<9}{finding.rule:<16}{finding.message}")
+        click.echo(f"{file}: {errors}, {count(counts['warning'], 'warning')}")
+    if counts["error"]:
+        raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
+
+
+@click.command()
+@click.argument("source", type=_PATH, metavar="IN", callback=as_scan)
+@click.argument("output", type=_PATH, metavar="OUT.h5")
+@scan_options
+@click.option("--pixel-size-um", type=POSITIVE, help="Pixel size at the sample.")
+@click.option("--energy-kev", type=POSITIVE, help="Photon energy.")
+@click.option("--sample", help="Name of the sample, for the record.")
+@click.option("--no-data", type=float, help="Pixel value that marks pixels without a measurement.")
+@json_option
+def ingest(
+    source: Path,
+    output: Path,
+    pixel_size_um: float | None,
+    energy_kev: float | None,
+    sample: str | None,
+    no_data: float | None,
+    as_json: bool,
+    **scan_facts: Any,
+) -> None:
+    """Copy the scan IN into the new HDF5 scan OUT.h5.
+
+    IN: a multi-page TIFF, folder or .zip of TIFFs, .txrm, or HDF5 (--data-path where its layout is not known). Frames
+    are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
+    """
+    from beamline.features.files.ingest import ingest as ingest_scan
+    from beamline.storage.readers.open import SourceOptions
+
+    clock = SystemClock()
+    began = clock.now()
+    with events_shown(as_json) as sink:
+        refuse_existing(output)
+        done = ingest_scan(
+            SourceOptions(source, **scan_facts),
+            output,
+            pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
+            energy_kev=energy_kev,
+            sample=sample,
+            no_data=no_data,
+            progress=counting("ingest", sink, clock),
+        )
+        seconds = clock.now() - began
+        sink(Done({**vars(done), "output": done.path, "seconds": seconds}, time=clock.now()))
+    if as_json:
+        return
+    click.echo(f"output   {done.path} ({done.definition})")
+    click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
+    for doubt in done.doubts:
+        click.echo(f"! {doubt}")
+    click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")

@@ -1,0 +1,182 @@
+"""ingest: any scan, frame by frame, into one of our files with statistics of each frame; whole or not at all.
+
+Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
+rounding would lose what was measured. They keep their type, at the same paths, under the definition
+`splatline_float_projections`, so that they do not count as counts; open_scan reads both.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.monitor.digest import digest
+from beamline.storage import hdf5
+from beamline.storage.flag_legend import UNMARKED
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.scan import altered_sentence, stated_used
+from beamline.storage.writer_lock import QUIET, held
+from beamline.storage.writers import layout
+from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding
+from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
+from beamline.storage.writers.whole import complete
+from drivers.base.frame import FrameKind
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What was written: `definition` says whether it is an NXtomo; `invalid_frames`: frames without a valid pixel.
+
+    `doubts`: what the input states that may change the volume, that is not used, and that the copy does not state.
+    """
+
+    path: Path
+    definition: str
+    frames: int
+    pixel_bytes: int
+    invalid_frames: int
+    doubts: tuple[str, ...] = ()
+
+
+def ingest(
+    scan: SourceOptions | Path | str,
+    out: Path | str,
+    *,
+    pixel_size_mm: float | None = None,
+    energy_kev: float | None = None,
+    sample: str | None = None,
+    no_data: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Ingested:
+    """Copy a scan into the new file `out`, one frame in memory at a time.
+
+    Args:
+        pixel_size_mm, energy_kev, sample: for the record, where the input does not say.
+        no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
+        progress: called with (frames written, frames in all) after each.
+
+    Raises:
+        DataError: unreadable input, `out` exists, or the disk does not take it. No half file is left.
+    """
+    out = Path(out)
+    with whole_file(out) as partial, open_scan(scan) as source:
+        ending = _ending_of(source)
+        _refuse_what_a_copy_would_not_state(source)
+        distance = source.attributes.get("distance_mm")
+        other_angles = isinstance(scan, SourceOptions) and (scan.angles is not None or scan.angles_path is not None)
+        if source.cone is not None:
+            distance = source.cone[1] - source.cone[0]
+        info = layout.ScanInfo(
+            sample=sample or str(source.attributes.get("sample", source.path.stem)),
+            title=f"ingested from {source.path.name}",
+            pixel_size_mm=pixel_size_mm or source.pixel_size_mm,
+            energy_kev=energy_kev or source.energy_kev,
+            axis_col=source.axis_col,
+            distance_mm=distance if isinstance(distance, int | float) else None,
+            source_distance_mm=None if source.cone is None else source.cone[0],
+            plan=json.dumps({} if other_angles else dict(source.plan)),
+        )
+        with hdf5.created(partial, layout.LIBVER) as file:
+            invalid = _copy(source, file, out, info, no_data, progress)
+            complete(file, ending)
+        definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
+        frames = int(source.image_key.size)
+        size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
+        doubts = tuple(finding.message for finding in stated_used(source) if finding.severity != "info")
+        return Ingested(out, definition, frames, size, invalid, doubts)
+
+
+def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
+    """Raise DataError for unknown angles, displaced views, altered rows and oblong pixels."""
+    views = source.image_key == FrameKind.PROJECTION
+    if unknown := np.count_nonzero(~np.isfinite(source.angles[views])):
+        raise DataError(
+            f"{source.path} does not say the angles of {unknown} of its {views.sum()} projections: give "
+            "--angles FILE (degrees, one a line). Nothing was written."
+        )
+    if source.shifts is not None:
+        raise DataError(
+            f"{source.path} states by how much its views are displaced, which the copy would not. Reconstruct it "
+            "as it is. Nothing was written."
+        )
+    if source.altered:
+        raise DataError(f"{altered_sentence(source)} Nothing was written.")
+    if source.row_pitch_mm is not None:
+        raise DataError(
+            f"{source.path} has pixels of {source.pixel_size_mm} x {source.row_pitch_mm:g} mm, and the copy states "
+            "one size. Reconstruct it as it is. Nothing was written."
+        )
+
+
+def _copy(
+    source: ScanSource,
+    file: hdf5.NewFile,
+    out: Path,
+    info: layout.ScanInfo,
+    no_data: float | None,
+    progress: Callable[[int, int], None] | None,
+) -> int:
+    dtype = source.dtype.newbyteorder("<")
+    layout.create(file, info, source.shape, dtype, quantity=source.quantity, preview_bin=4, start=None)
+    if no_data is not None:
+        file["/entry/record/no_data"] = float(no_data)
+    if source.part_starts.size > 1:
+        file[layout.PART_STARTS] = source.part_starts
+    rows = Rows(file)
+    saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
+    n, invalid = int(source.image_key.size), 0
+    for i, (given, record) in enumerate(_frames(source)):
+        image = given.astype(dtype, copy=False)
+        if i in source.unreadable:
+            raise DataError(f"{source.unreadable[i]} Nothing is left of {out}.")
+        if i in source.damaged:
+            raise DataError(
+                f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
+                f"good copy; `beamline validate --deep` looks at all frames. Nothing is left of {out}."
+            )
+        statistics = digest(image, saturation=saturation, no_data=no_data)
+        invalid += statistics.invalid_fraction == 1.0
+        rows.write(i, image, statistics, record)
+        file.require_taken()
+        if progress is not None:
+            progress(i + 1, n)
+        if (i + 1) % PER_FLUSH == 0:
+            rows.flush()
+    rows.flush()
+    return invalid
+
+
+def _ending_of(source: ScanSource) -> ScanEnding:
+    """How the scan ended. DataError while it runs: what it lacks is not known yet."""
+    if source.ending.status != RUNNING:
+        return source.ending
+    if held(source.path) or time.time() - source.path.stat().st_mtime < QUIET:
+        raise DataError(
+            f"{source.path} is being written, or its program died less than {QUIET:.0f} s ago. Let the scan end. "
+            "Nothing was written."
+        )
+    return replace(source.ending, status="failed", reason=DIED)
+
+
+def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
+    """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
+    flags = source.flags
+    if source.dtype == np.uint16:
+        for i, frame in enumerate(source.frames()):
+            known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
+            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i))
+        return
+    keys, angles, exposures = source.image_key, source.angles, source.exposures
+    for i in range(keys.size):
+        record = Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
+        yield source.read([i])[0], record

@@ -1,0 +1,93 @@
+"""What is made of the Gaussians behind a volume: voxels of any grid, and views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.gaussians.model import Model
+from beamline.monitor.digest import digest
+from beamline.storage import hdf5
+from beamline.storage.writers import layout
+from beamline.storage.writers.ending import ScanEnding
+from beamline.storage.writers.rows import PER_FLUSH, Record, Rows
+from beamline.storage.writers.whole import complete
+from drivers.base.frame import FrameKind
+from recon.base.volume import Grid, Volume
+from recon.splatting.splat import project, voxelize
+
+_SLICES = 16  # made at a time
+
+
+def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ...] | None) -> Grid:
+    """A grid of cubes of edge `voxel` in a box ((z0, z1), (y0, y1), (x0, x1)); None: those of `grid`.
+
+    Raises:
+        ValueError: the box holds no voxel.
+    """
+    edge = grid.voxel_size if voxel is None else voxel
+    if box is None:
+        (x0, y0, z0), (x1, y1, z1) = grid.edges
+        box = ((z0, z1), (y0, y1), (x0, x1))
+    shape = tuple(round((high - low) / edge) for low, high in box)
+    if min(shape) < 1:
+        raise ValueError(f"a box of {box} holds no voxel of {edge:g}: {shape}")
+    return Grid(shape, edge, tuple((low + high) / 2 for low, high in box))  # type: ignore[arg-type]
+
+
+def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Volume:
+    """The model on a grid, sixteen slices at a time; `count` takes slices done and all."""
+    data = np.empty(grid.shape, np.float32)
+    for first in range(0, grid.shape[0], _SLICES):
+        part = slice(first, min(first + _SLICES, grid.shape[0]))
+        box = grid.part(part, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
+        data[part] = voxelize(model.gaussians, box).numpy()
+        count(part.stop, grid.shape[0])
+    return Volume(data, grid)
+
+
+def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Callable[[int, int], None]) -> None:
+    """Line integrals of the model at `angles` [view] in radians: a scan of ours, which every command reads.
+
+    It states quantity, pixel size, axis and cone, and has the /exchange view of Data Exchange. The views are straight,
+    in their place: the poses of the views that were fitted are those of their own angles.
+
+    Raises:
+        DataError: a cone that a scan file cannot state, `path` exists, or the disk refuses; nothing is left.
+    """
+    first_view, in_mm = model.geometry.select([0]), model.record.length_unit == "mm"
+    geometry = replace(first_view.straightened(), shifts=np.zeros((1, 2))).at(angles)
+    middle = (geometry.detector_shape[0] - 1) / 2
+    if geometry.is_cone and not (in_mm and abs(geometry.axis_row - middle) < 1e-3):
+        raise DataError(
+            f"The cone of {path} meets the detector at right angles in row {geometry.axis_row:g}, with lengths in "
+            f"{model.record.length_unit}; a scan file states cones in mm about the middle row, {middle:g}. Reconstruct "
+            "all rows, with a pixel size. Nothing was written."
+        )
+    info = layout.ScanInfo(
+        sample=model.record.sample,
+        title=f"views of the Gaussians behind {model.record.title}",
+        pixel_size_mm=geometry.pixel_pitch if in_mm else None,
+        axis_col=geometry.axis_col,
+        source_distance_mm=geometry.sod if geometry.is_cone else None,
+        distance_mm=geometry.sdd - geometry.sod if geometry.is_cone else None,
+    )
+    with whole_file(path) as partial, hdf5.created(partial, layout.LIBVER) as file:
+        kind = np.dtype("<f4")
+        layout.create(file, info, geometry.detector_shape, kind, quantity="line_integrals", preview_bin=4, start=None)
+        rows = Rows(file)
+        for view in range(angles.size):
+            image = project(model.gaussians, geometry, [view]).numpy()[0]
+            rows.write(view, image, digest(image, None), Record(FrameKind.PROJECTION, float(angles[view])))
+            file.require_taken()
+            count(view + 1, angles.size)
+            if view % PER_FLUSH == PER_FLUSH - 1:
+                rows.flush()
+        rows.flush()
+        complete(file, ScanEnding())

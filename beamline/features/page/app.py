@@ -1,0 +1,312 @@
+"""The page's server: files of the page, the feed of events, tiles, and verbs for who may act.
+
+A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
+host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the
+token for acting in a header. No data of a client reach the file system.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
+from dataclasses import astuple, dataclass, field
+from functools import partial
+from importlib.resources import files
+from threading import Event
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from beamline.core.errors import BeamlineError, user_message
+from beamline.core.files import bytes_below
+from beamline.features.page.viewer import reader_of, viewer_routes
+from beamline.page.recording import Recording
+from beamline.page.run_files import PICTURE, Reader
+from beamline.page.tiles import number_of, region_of, tile_of
+from beamline.page.volume import ShownVolume
+from beamline.scan.control import POLL, Verb, ask
+
+COOKIE = "splatline_look_"
+"""Name of the cookie, before the port: a browser sends a cookie to all ports of a host."""
+ACT_HEADER = "x-act-token"
+_PERIOD = 0.5  # s between two checks of the file for the feed
+_STATIC = files("beamline.features.page") / "static"
+_KEPT = 64  # answers kept for the next client
+_NO_VERB = "do what is no verb"
+_PLACES = 200  # requests with a token that are answered at the same time; an open page is one, and a verb takes none
+MOST_STRANGERS = 100  # connections without a token: a browser shows its own within milliseconds
+_HEADERS = {
+    b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
+    b"form-action 'none'; frame-ancestors 'none'",
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"cache-control": b"no-store",
+}
+
+
+class Strangers:
+    """Connections that have shown no token. Each is closed in time, and the oldest when there are many, so that they
+    take no place of those who have one. All calls come from the thread of the server."""
+
+    def __init__(self) -> None:
+        self._ends: dict[object, Callable[[], None]] = {}
+
+    def enter(self, client: object, end: Callable[[], None]) -> None:
+        """A new connection, and what closes it."""
+        if len(self._ends) >= MOST_STRANGERS:
+            self.end(next(iter(self._ends)))
+        self._ends[client] = end
+
+    def leave(self, client: object) -> None:
+        """It has shown a token, or is closed."""
+        self._ends.pop(client, None)
+
+    def end(self, client: object) -> None:
+        """Close a connection, if it is still one of these."""
+        self._ends.pop(client, _nothing)()
+
+
+def _nothing() -> None:
+    """There is nothing to close."""
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may do what."""
+
+    hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
+    look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
+    act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
+    ended: Event = field(default_factory=Event)  # set when the server ends
+    strangers: Strangers = field(default_factory=Strangers)
+
+
+class Guard:
+    """Sets the headers of every answer, and refuses requests to another host, or without the token for looking."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+        self._cookie = COOKIE + access.hosts[0].rpartition(":")[2]
+        self._answering = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                given = [(name, value) for name, value in message["headers"] if name.lower() not in _HEADERS]
+                message = {**message, "headers": [*given, *_HEADERS.items()]}
+            await send(message)
+
+        request = Request(scope)
+        if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
+            await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
+        elif _same(request.cookies.get(self._cookie, ""), self._access.look):
+            self._access.strangers.leave(scope["client"])
+            await self._answer(request, scope, receive, send_with_headers)
+        elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
+            answer: Response = RedirectResponse("/", 303)
+            answer.set_cookie(self._cookie, self._access.look, httponly=True, samesite="strict")
+            await answer(scope, receive, send_with_headers)
+        else:
+            text = "This page needs the token in the address that was printed at its start.\n"
+            await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
+
+    async def _answer(self, request: Request, scope: Scope, receive: Receive, send: Send) -> None:
+        may_act = self._access.act is not None and _same(request.headers.get(ACT_HEADER, ""), self._access.act)
+        if self._answering >= _PLACES and not may_act:
+            await Response("Too many pages are open.\n", 503, media_type="text/plain")(scope, receive, send)
+            return
+        self._answering += 1
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._answering -= 1
+
+
+def _same(given: str, expected: str) -> bool:
+    return secrets.compare_digest(given.encode(), expected.encode())
+
+
+def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
+    """The application. `log`: takes a line for each verb that was sent, with the client's address."""
+    return guarded("index.html", page_routes(reader, access, log), access)
+
+
+def viewer(volumes: Sequence[ShownVolume], access: Access) -> Starlette:
+    """The application for one volume, or two to compare."""
+    return guarded("view.html", viewer_routes(reader_of(volumes)), access)
+
+
+def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> list[BaseRoute]:
+    """What a page of a run asks for; below `view/` its newest volume, by itself and in the viewer."""
+    server = _Server(reader, access, log)
+    return [
+        Mount("/view", begins_with("view.html", viewer_routes(reader.on_volumes))),
+        Route("/api/facts", server.facts),
+        Route("/api/feed", server.feed),
+        Route("/api/columns", server.columns),
+        Route("/api/flags", server.flags),
+        Route("/api/frame/{frame:number}", server.frame),
+        Route("/api/sinogram", server.sinogram),
+        Route("/api/trace", server.trace),
+        Route("/api/model.png", server.model),
+        Route("/api/verb/{verb}", server.verb, methods=["POST"]),
+    ]
+
+
+def guarded(start: str, routes: Sequence[BaseRoute], access: Access) -> Starlette:
+    """An application of these answers that begins with a page of `static`, behind the guard."""
+    static = Mount("/static", StaticFiles(directory=str(_STATIC)))
+    return begins_with(start, [static, *routes], [Middleware(Guard, access=access)])
+
+
+def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
+    """An application of these answers that begins with a page of `static`."""
+    text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
+    first = Route("/", lambda request: HTMLResponse(text))
+    return Starlette(routes=[first, *routes], middleware=middleware, exception_handlers={BeamlineError: _refused})
+
+
+def _refused(request: Request, error: Exception) -> Response:
+    """What no file gives, as a sentence."""
+    return JSONResponse({"message": user_message(error)}, 404)
+
+
+class _Server:
+    """Answers requests; Starlette calls what is not a coroutine in a thread of its own."""
+
+    def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
+        self._reader, self._access, self._log = reader, access, log
+        self._kept: dict[tuple[object, ...], Response] = {}  # of the reading thread
+        self._state: dict[str, Any] = {}
+        self._looked = 0.0
+        self._looking = asyncio.Lock()
+
+    def facts(self, request: Request) -> Response:
+        facts = self._reader.do(Recording.facts)
+        what = self._reader.what
+        path = str((what.folder or what.scan).resolve())
+        return JSONResponse({**facts, "run": what.name, "path": path, "may_act": self._access.act is not None})
+
+    async def feed(self, request: Request) -> Response:
+        """Server-sent events: each event of the run with its number as id, `state` whenever it changes, and `end`."""
+        last = request.headers.get("last-event-id", request.query_params.get("last", ""))
+        first = int(last) + 1 if last.isdecimal() and len(last) < 10 else 0
+        return StreamingResponse(self._feed(first), media_type="text/event-stream")
+
+    async def _feed(self, first: int) -> AsyncIterator[str]:
+        sent, ended = "", False
+        while not ended:
+            ended = self._access.ended.is_set()  # then what came last is still told
+            state = await self._now(at_once=ended)
+            lines = self._reader.events.lines
+            for number in range(first, len(lines)):
+                yield f"id: {number}\nevent: run\ndata: {lines[number]}\n\n"
+            first = max(first, len(lines))
+            now = json.dumps(state)
+            if now != sent:
+                sent = now
+                yield f"event: state\ndata: {now}\n\n"
+            if not ended:
+                await asyncio.sleep(_PERIOD)
+        yield "event: end\ndata: {}\n\n"
+
+    async def _now(self, *, at_once: bool) -> dict[str, Any]:
+        """The state, looked at once for all clients."""
+        async with self._looking:
+            if at_once or time.monotonic() - self._looked >= _PERIOD:  # so that all ask for the same frame
+                self._state = await run_in_threadpool(self._reader.state)
+                self._looked = time.monotonic()
+        return self._state
+
+    def columns(self, request: Request) -> Response:
+        first = number_of(request, "first")
+        return self._of_now(lambda file: JSONResponse(file.columns(first)), "columns", first)
+
+    def flags(self, request: Request) -> Response:
+        return self._of_now(lambda file: JSONResponse(file.flags()), "flags")
+
+    def frame(self, request: Request) -> Response:
+        frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
+        region = region_of(request)
+
+        def made(file: Recording) -> Response:
+            values, shown, factor = file.picture(frame, region, corrected=corrected)
+            return tile_of(values, {"frame": frame, "region": astuple(shown), "bin": factor})
+
+        return self._once(made, lambda file: (frame, region, corrected, file.has_references))
+
+    def sinogram(self, request: Request) -> Response:
+        row, first = number_of(request, "row"), number_of(request, "first")
+
+        def made(file: Recording) -> Response:
+            lines, views, factor = file.sinogram(row, first)
+            return tile_of(lines, {"views": views.tolist(), "bin": factor})
+
+        return self._of_now(made, "sinogram", row, first)
+
+    def trace(self, request: Request) -> Response:
+        region, first = region_of(request), number_of(request, "first")
+        return self._of_now(
+            lambda file: JSONResponse({"first": first, "values": file.trace(region, first)}), "trace", region, first
+        )
+
+    def _of_now(self, make: Callable[[Recording], Response], *asked: object) -> Response:
+        """An answer that holds until there are more frames."""
+        return self._once(make, lambda file: (file.progress(), *asked))
+
+    def _once(self, make: Callable[[Recording], Response], key: Callable[[Recording], tuple[object, ...]]) -> Response:
+        """The answer that many ask for at the same time, made once: all are made in the reading thread."""
+
+        def kept(file: Recording) -> Response:
+            identity = key(file)
+            if identity not in self._kept:
+                self._kept[identity] = make(file)
+                if len(self._kept) > _KEPT:
+                    del self._kept[next(iter(self._kept))]
+            return self._kept[identity]
+
+        return self._reader.do(kept)
+
+    def model(self, request: Request) -> Response:
+        """The live picture: newest view, the volume seen from there, their difference in noise."""
+        run, picture = self._reader.what.run, b""
+        if run is not None:
+            with suppress(OSError):
+                picture = bytes_below(run, PICTURE)
+        return Response(picture, media_type="image/png") if picture else Response(status_code=404)
+
+    async def verb(self, request: Request) -> Response:
+        """Send a verb to the run: at once, while the threads that answer other requests may all be busy."""
+        folder, act = self._reader.what.folder, self._access.act
+        client = request.client.host if request.client else "?"
+        name = next(
+            (str(verb) for verb in Verb if verb == request.path_params["verb"]), _NO_VERB
+        )  # never what was sent
+        ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
+        if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
+            self._log(f"refused: {name} from {client}, without the token for acting")
+            return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
+        if folder is None or name == _NO_VERB:
+            return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
+        self._log(f"{name}, asked for from {client}")
+        asked = ask(folder, Verb(name))
+        while (state := await run_in_threadpool(asked.state)) is None:
+            await asyncio.sleep(POLL)
+        return JSONResponse({"state": str(state)})

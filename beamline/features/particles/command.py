@@ -1,0 +1,154 @@
+"""`beamline segment`: particles of a volume, their sizes and places."""
+
+from __future__ import annotations
+
+import importlib.util
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamline.cli.options import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    FiniteRange,
+    NameChoice,
+    json_events,
+    json_option,
+    volume_argument,
+)
+from beamline.cli.recipe import Repeatable, repeating
+from beamline.core.errors import ConfigError
+from beamline.core.events import Done
+from beamline.core.stop import terminated_like_interrupted
+from drivers.base.clock import SystemClock
+from recon.base.choices import NECK
+
+if TYPE_CHECKING:
+    from beamline.features.particles.run import Segmented, SegmentOptions
+
+_PERCENT = FiniteRange(min=0, max=100)
+
+
+@click.command(cls=Repeatable)
+@volume_argument
+@click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
+@click.option("--voxel-um", type=POSITIVE, help="Edge of a voxel. Default: as the file says, else lengths are voxels.")
+@click.option(
+    "--crop",
+    type=NameChoice(["square", "none"]),
+    default="square",
+    show_default=True,
+    help="square: the one inside the circle of the sample, without its wall; none: the whole volume.",
+)
+@click.option("--margin", type=FiniteRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
+              help="Share of the square's side taken off at each end.")  # fmt: skip
+@click.option("--percentiles", type=_PERCENT, nargs=2, default=(0.5, 99.5), show_default=True, metavar="LOW HIGH",
+              help="Grey values below and above are cut.")  # fmt: skip
+@click.option("--gamma", type=POSITIVE, default=1.0, show_default=True, help="Power of the grey values, from 0 to 1.")
+@click.option(
+    "--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Width of the Gaussian filter, voxels."
+)
+@click.option(
+    "--clusters", type=click.IntRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
+)
+@click.option("--radius", type=click.IntRange(0, 20), default=1, show_default=True,
+              help="Radius of opening and closing, voxels; 0: neither.")  # fmt: skip
+@click.option("--smallest", type=click.IntRange(min=0), default=27, show_default=True,
+              help="Voxels of the smallest particle that is kept.")  # fmt: skip
+@click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
+              help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "
+              "always.")  # fmt: skip
+@click.option("--napari", "view", is_flag=True, help="Then open volume and labels in napari, if it is installed.")
+@click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of the clusters' starts.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="HDF5 file of the labels; .csv and .png lie beside it. Default: VOLUME's stem + _particles.h5, here.",
+)
+@json_option
+def segment(
+    volume: Path,
+    voxel_um: float | None,
+    crop: str,
+    margin: float,
+    clusters: int | None,
+    view: bool,
+    output: Path | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Segment the dense particles of VOLUME: a reconstruction, or any HDF5, TIFF, NumPy or NIfTI volume.
+
+    The grey values are rescaled between percentiles and smoothed, and parted by k-means. Particles are what is above
+    half-way between the brightest cluster and the largest other one; opened, closed, filled, parted where they touch.
+
+    Writes the labels as HDF5, a table of particles (volume, equivalent diameter, centroid) as CSV, and a picture of
+    slices with labels. Look at the picture before you count. Nothing is overwritten.
+    """
+    from beamline.features.particles.run import SegmentOptions, settings_of
+    from beamline.features.particles.run import segment as segment_volume
+
+    if view and importlib.util.find_spec("napari") is None:
+        raise ConfigError("--napari: napari is not installed. Install it with: pip install 'napari[all]'")
+    output = output or Path(f"{volume.name.split('.')[0]}_particles.h5")
+    if output.suffix.lower() in (".csv", ".png"):
+        raise click.UsageError(f"--output {output} is the HDF5 file of the labels; name it .h5")
+    options = SegmentOptions(
+        volume=volume,
+        output=output,
+        voxel_mm=None if voxel_um is None else voxel_um * 1e-3,
+        margin=margin if crop == "square" else None,
+        n_clusters=clusters,
+        command=repeating(click.get_current_context(), volume, output),
+        **values,
+    )
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        labels = segment_volume(options)
+        files = {"output": output, "table": options.table, "picture": options.picture}
+        sink(Done({**files, **settings_of(labels, options)}, time=SystemClock().now()))
+    if not as_json:
+        click.echo(summary(labels, options))
+    if view:
+        show(labels)
+
+
+def summary(result: Segmented, options: SegmentOptions) -> str:
+    """The result for people."""
+    figures, unit = result.particles.statistics(), result.unit
+    _, rows, cols = result.box
+    crop = "none, the whole volume"
+    if options.margin is not None:
+        crop = (
+            f"rows {rows.start}-{rows.stop - 1}, columns {cols.start}-{cols.stop - 1} of each slice: the square inside "
+            f"the circle of the sample, less {options.margin:.3g} of its side at each end (--crop none, --margin)"
+        )
+    lines = [
+        f"{'labels':<12}{options.output}",
+        f"{'table':<12}{options.table}",
+        f"{'picture':<12}{options.picture}",
+        f"{'box':<12}{' x '.join(map(str, result.labels.shape))} voxels of {result.volume.grid.voxel_size:g} {unit}",
+        f"{'crop':<12}{crop}",
+        f"{'clusters':<12}{result.clusters.centres.size}, threshold {result.clusters.threshold:.3f} of the range",
+        f"{'particles':<12}{figures['particles']:.0f}, {figures['cut']:.0f} of them cut by a face of the box",
+    ]
+    if result.outside:
+        bodies, verb = ("1 body", "is") if result.outside == 1 else (f"{result.outside} bodies", "are")
+        bodies = f"{bodies} as bright outside the square {verb}"
+        lines.append(f"{'left out':<12}{bodies} no particle here; --crop none takes the whole volume, with its wall")
+    if "d50" in figures:
+        sizes = ", ".join(f"{name} {figures[name]:.4g}" for name in ("d10", "d50", "d90"))
+        lines.append(f"{'diameter':<12}{sizes} {unit} (equivalent, of whole particles)")
+    return "\n".join(lines)
+
+
+def show(result: Segmented) -> None:
+    """Open volume and labels in napari, until its window is closed."""
+    napari = import_module("napari")
+    viewer, spacing = napari.Viewer(), result.volume.grid.spacing
+    viewer.add_image(result.volume.data, scale=spacing, name="volume")
+    viewer.add_labels(result.labels, scale=spacing, name="particles")
+    napari.run()

@@ -1,0 +1,312 @@
+"""A volume file in; labels, a table of particles and a picture out."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import refuse_existing, whole_file, write_whole
+from beamline.core.shipped import version
+from beamline.report.figures import downwards, grey_window, png, show_grey
+from beamline.storage import hdf5
+from beamline.storage.readers.open import open_scan
+from beamline.storage.volume_file import axes_of
+from beamline.storage.volumes.files import whole_volume
+from beamline.storage.writers.recon_file import DEVIATION
+from recon.base.volume import Grid, Volume
+from recon.features.particles.particles import (
+    NECK,
+    Particles,
+    bodies_outside,
+    cleaned,
+    measured,
+    parted,
+    volume_deviation,
+)
+from recon.post.clusters import Clusters, clusters
+from recon.post.enhance import Box, enhanced, enhanced_deviation, grey_at, inscribed_box, sample_circle
+
+_SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """What to segment and how; the steps are those of recon.post.
+
+    Attributes:
+        dataset: the array in the file; None: the volume of a reconstruction, or the only array.
+        output: HDF5 file of the labels; the table and the picture lie beside it.
+        voxel_mm: edge of a voxel where the file does not say it; None: as the file says, or 1 px.
+        margin: of the square inside the sample's circle; None: the whole volume.
+        n_clusters: of grey values; None: by the elbow rule.
+        neck: where touching particles are parted; 0: nowhere.
+    """
+
+    volume: Path
+    dataset: str | None
+    output: Path
+    voxel_mm: float | None = None
+    margin: float | None = 0.05
+    percentiles: tuple[float, float] = (0.5, 99.5)
+    gamma: float = 1.0
+    sigma: float = 0.7
+    n_clusters: int | None = None
+    radius: int = 1
+    smallest: int = 27
+    neck: float = NECK
+    seed: int = 0
+    command: str = ""
+
+    @property
+    def table(self) -> Path:
+        return self.output.with_suffix(".csv")
+
+    @property
+    def picture(self) -> Path:
+        return self.output.with_suffix(".png")
+
+
+@dataclass(frozen=True, eq=False)
+class Segmented:
+    """What was found.
+
+    Attributes:
+        box: the part of the volume in the file that was segmented.
+        volume: this part, as it is in the file, on its grid.
+        unit: "mm", or "px" where nobody knows the size of a voxel.
+        labels: int32 [z, y, x] of the same shape; 0: no particle.
+        clusters: of the enhanced grey values.
+        particles: of the labels.
+        volume_deviation: of each particle's volume; None where the file has no error bars.
+        outside: bodies as bright as particles, and as large as the smallest, that lie outside the box; not the wall.
+    """
+
+    box: Box
+    volume: Volume
+    unit: str
+    labels: NDArray[np.int32]
+    clusters: Clusters
+    particles: Particles
+    volume_deviation: NDArray[np.float64] | None = None
+    outside: int = 0
+
+
+def segment(options: SegmentOptions) -> Segmented:
+    """Segment the volume, and write labels, table and picture; all of them or none.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    for path in (options.output, options.table, options.picture):
+        refuse_existing(path)
+    volume, unit = _read(options)
+    try:
+        segmented = _segmented(volume, unit, options)
+    except ValueError as error:
+        raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
+    written = list[Path]()
+    try:
+        with whole_file(options.output) as partial:
+            _write_labels(partial, segmented, options)
+        written.append(options.output)
+        write_whole(options.table, table_of(segmented))
+        written.append(options.table)
+        write_whole(
+            options.picture, picture_of(segmented.volume, segmented.unit, segmented.labels, segmented.particles)
+        )
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
+    return segmented
+
+
+def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
+    nz, ny, nx = volume.grid.shape
+    box: Box = slice(0, nz), slice(0, ny), slice(0, nx)
+    whole, outside = volume.data, 0
+    if options.margin is not None:
+        box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
+        volume = Volume(np.ascontiguousarray(volume.data[box]), volume.grid.part(*box))
+    grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
+    greys = clusters(grey, options.n_clusters, options.seed)
+    labels = parted(cleaned(grey > greys.threshold, options.radius, options.smallest), options.neck)
+    if options.margin is not None:
+        bright = whole > grey_at(volume.data, greys.threshold, options.percentiles, options.gamma)
+        outside = bodies_outside(cleaned(bright, options.radius, options.smallest), box)
+    particles, bars = measured(labels, volume.grid.spacing, volume.grid.first), None
+    deviation = _deviation(options, box)
+    if deviation is not None and deviation.shape == volume.data.shape:
+        of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
+        bars = volume_deviation(labels, grey, of_grey, greys.threshold) * np.prod(volume.grid.spacing)
+    return Segmented(box, volume, unit, labels, greys, particles, bars, outside)
+
+
+def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
+    """The standard deviation of the voxels in the box, beside the volume of a reconstruction; None without it."""
+    if options.dataset not in (None, _SIGNAL) or not h5py.is_hdf5(options.volume):
+        return None
+    with hdf5.open_hdf5(options.volume) as file:
+        deviation = file.get(f"entry/data/{DEVIATION}")
+        return np.asarray(deviation[box], np.float32) if isinstance(deviation, h5py.Dataset) else None
+
+
+def _read(options: SegmentOptions) -> tuple[Volume, str]:
+    """The volume on its grid, and the unit of length.
+
+    Raises:
+        ConfigError, DataError: it cannot be read, or is no volume of finite numbers.
+    """
+    path, dataset = options.volume, options.dataset
+    spacing: tuple[float, ...] | None = None
+    first: tuple[float, ...] | None = None
+    if path.is_file() and h5py.is_hdf5(path):
+        if dataset is None and _is_scan(path):
+            raise DataError(
+                f"{path} is a scan: its frames are no slices. Reconstruct it with `beamline recon`, and segment the "
+                "volume. Nothing was written."
+            )
+        with hdf5.open_hdf5(path) as file:
+            if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
+                dataset = _SIGNAL
+            spacing, first = axes_of(file, dataset)
+    data, stated = whole_volume(path, dataset)
+    if data.ndim != 3 or data.dtype.kind not in "fiub" or min(data.shape) < 3:
+        raise DataError(f"{path} holds {data.dtype} of shape {data.shape}; expected real numbers [z, y, x], 3 or more.")
+    values = np.ascontiguousarray(data, np.float32)
+    if not np.isfinite(values).all():
+        raise DataError(f"{path} has values that are not finite; nothing was written.")
+    if options.voxel_mm is not None:
+        spacing, first = (options.voxel_mm,) * 3, None
+    spacing = spacing or stated
+    z, y, x = spacing or (1.0, 1.0, 1.0)
+    if abs(y - x) > 1e-3 * x:
+        raise ConfigError(f"{path} has voxels of {y:g} by {x:g} mm in a slice; square ones are expected.")
+    grid = Grid(values.shape, x, slice_pitch=z)
+    if first is not None:
+        centre = tuple(low + (n - 1) / 2 * edge for low, n, edge in zip(first, values.shape, (z, y, x), strict=True))
+        grid = Grid(values.shape, x, centre, z)
+    return Volume(values, grid), "px" if spacing is None else "mm"
+
+
+def _is_scan(path: Path) -> bool:
+    try:
+        with open_scan(path):
+            return True
+    except DataError:
+        return False
+
+
+def table_of(found: Segmented) -> str:
+    """One line a particle, largest first."""
+    unit, particles, out = found.unit, found.particles, io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    heading = [f"volume_{unit}3", f"equivalent_diameter_{unit}", f"z_{unit}", f"y_{unit}", f"x_{unit}", "cut"]
+    bars = found.volume_deviation
+    interval = [] if bars is None else [f"volume_low_{unit}3", f"volume_high_{unit}3"]
+    writer.writerow(["label", *heading, *interval])
+    for i in np.argsort(-particles.volume, kind="stable").tolist():
+        sizes = (particles.volume[i], particles.diameter[i], *particles.centroid[i])
+        ends = () if bars is None else (max(particles.volume[i] - bars[i], 0.0), particles.volume[i] + bars[i])
+        row = [particles.label[i], *(f"{value:.6g}" for value in sizes), int(particles.cut[i])]
+        writer.writerow([*row, *(f"{value:.6g}" for value in ends)])
+    return out.getvalue()
+
+
+def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
+    """Everything that the labels depend on, and the figures of all particles, by name."""
+    low, high = options.percentiles
+    return {
+        "margin": "none" if options.margin is None else options.margin,
+        "percentile_low": low, "percentile_high": high, "gamma": options.gamma, "sigma": options.sigma,
+        "clusters": found.clusters.centres.size, "threshold": found.clusters.threshold, "radius": options.radius,
+        "smallest": options.smallest, "neck": options.neck, "seed": options.seed,
+        **found.particles.statistics(), "outside": found.outside, "unit": found.unit,
+    }  # fmt: skip
+
+
+def _write_labels(partial: Path, found: Segmented, options: SegmentOptions) -> None:
+    with hdf5.created(partial) as file:
+        file.attrs["default"] = "entry"
+        entry = file.create_group("entry")
+        entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"
+        process = entry.create_group("process")
+        process.attrs["NX_class"] = "NXprocess"
+        process["program"], process["version"], process["command"] = "splatline", version(), options.command
+        process["volume"] = str(options.volume.resolve())
+        for name, value in settings_of(found, options).items():
+            process[name] = value
+        data = entry.create_group("data")
+        data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "labels", ["z", "y", "x"]
+        chunks = (1, *found.labels.shape[1:])
+        data.create_dataset("labels", data=found.labels, chunks=chunks, compression="gzip", compression_opts=1)
+        for name, centres in zip(("z", "y", "x"), found.volume.grid.coordinates(), strict=True):
+            data[name] = centres
+            data[name].attrs["units"] = found.unit
+
+
+_SLICES, _WIDTH, _DPI = 3, 8.6, 110
+_COLOURS = 12
+
+
+def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: Particles) -> bytes:
+    """Three slices as they are, the same with each particle in a colour, and a histogram of diameters, as PNG."""
+    z, y, x = volume.grid.coordinates()
+    at = np.linspace(0, z.size - 1, _SLICES + 2).round().astype(int)[1:-1]
+    half = volume.grid.voxel_size / 2
+    extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
+    column = _WIDTH / _SLICES
+    figure = Figure(figsize=(_WIDTH, 2 * column * y.size / x.size + 3.2), dpi=_DPI, layout="constrained")
+    ratios = (2 * column * y.size / x.size + 0.8, 2.4)
+    upper, lower = np.ravel(figure.subfigures(2, 1, squeeze=False, height_ratios=ratios))
+    panels = upper.subplots(2, _SLICES, sharex=True, sharey=True)
+    window = grey_window([volume.data[at]])
+    # Neighbours in the order of labels get different colours; the same colour comes again after twelve.
+    colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
+    for column_of, k in zip(panels.T, at, strict=True):
+        for axes in column_of:
+            show_grey(axes, volume.data[k], window, extent)
+            axes.tick_params(labelsize=6)
+        shown = np.where(labels[k] > 0, (labels[k] - 1) % _COLOURS + 1, 0)
+        shown[1:][(labels[k][1:] != labels[k][:-1]) & (labels[k][:-1] > 0)] = 0  # a line between those that touch
+        shown[:, 1:][(labels[k][:, 1:] != labels[k][:, :-1]) & (labels[k][:, :-1] > 0)] = 0
+        column_of[1].imshow(
+            shown, cmap=colours, vmin=0, vmax=_COLOURS, extent=extent, interpolation="nearest", alpha=0.65
+        )
+        n = np.unique(labels[k]).size - bool((labels[k] == 0).any())
+        column_of[1].set_xlabel(f"x ({unit})", fontsize=7)
+        column_of[0].set_title(f"z = {z[k]:.3g} {unit}", fontsize=8)
+        column_of[1].set_title(f"{n} particles here", fontsize=8)
+    for axes in panels[:, 0]:
+        axes.set_ylabel(downwards("y", unit), fontsize=7)
+    axes = lower.subplots()
+    whole = ~particles.cut
+    if particles.label.size:
+        bins = np.histogram_bin_edges(particles.diameter, bins=min(30, max(5, particles.label.size // 4)))
+        parts = [particles.diameter[whole], particles.diameter[~whole]]
+        axes.hist(parts, bins.tolist(), stacked=True, color=["tab:blue", "0.7"], label=["whole", "cut by a face"])
+        axes.legend(fontsize=8)
+    axes.set_xlabel(f"equivalent diameter ({unit})", fontsize=8)
+    axes.set_ylabel("particles", fontsize=8)
+    axes.set_title(f"{particles.label.size} particles, {int(particles.cut.sum())} of them cut by a face", fontsize=9)
+    axes.tick_params(labelsize=7)
+    return png(figure)
+
+
+def figure_colours() -> list[tuple[float, float, float, float]]:
+    """Twelve bright colours, neighbours far apart in hue."""
+    from matplotlib import colormaps
+
+    hues = np.mod(np.arange(_COLOURS) * 5 / _COLOURS, 1.0)  # 5 and 12 have no common factor
+    return [tuple(colour) for colour in colormaps["hsv"](hues).tolist()]

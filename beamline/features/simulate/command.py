@@ -1,0 +1,146 @@
+"""`beamline simulate`: frames of a scene without an instrument, their cost, their labels and the truth behind them."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from dataclasses import asdict
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.options import json_events, with_request
+from beamline.cli.terminal import Terminal
+from beamline.core.errors import ConfigError, ScanStopped
+from beamline.core.events import CostExplained, Done, Sink
+from beamline.core.files import refuse_existing, remove, write_whole
+from beamline.core.machine import free_memory, machine, machine_line
+from beamline.core.shipped import shipped_scenes
+from beamline.core.sinks import fan_out
+from beamline.core.stop import StopOnSignal, terminated_like_interrupted
+from beamline.core.text import size
+from beamline.scenes.request import Output, SimulateRequest
+from drivers.base.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.features.simulate.write import SimulatedScan
+    from beamline.scenes.scene_file import SceneFile
+    from simulators.scenes.expose import Scan
+
+
+@click.command(epilog=f"Scenes that come with the package: {', '.join(shipped_scenes())}.")
+@with_request(SimulateRequest)
+def simulate(request: SimulateRequest) -> None:
+    """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
+
+    Only the effects that the scene names are computed. The file has the format of the instrument, which
+    `beamline recon` reads. A scene with `emission` gives the counts of a sample that emits (PET), which it reads, too.
+    The first Ctrl-C stops after the current frame, with a readable file and its labels; the
+    second stops at once.
+
+    Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
+    """
+    from beamline.features.simulate.scene import exposure_errors, scan_of
+    from beamline.features.simulate.write import check_output
+    from beamline.scenes.scene_file import feature_of, open_scene
+
+    clock = SystemClock()
+    with terminated_like_interrupted(), json_events(request.as_json) as sink, exposure_errors(request.scene):
+        if not (request.explains or request.out or request.truth or request.picture):
+            raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
+        if request.truth_bin and not request.truth:
+            raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
+        if (module := feature_of(request.scene, request.overrides)) is not None:
+            import_module(module).run(request, Output(sink, clock, plain=not request.as_json), sink)
+            return
+        picture = request.out.with_suffix(".png") if request.out and not request.picture else request.picture
+        _refuse_outputs(request.out, request.truth, picture)
+        opened = open_scene(request.scene, request.overrides)
+        scan = scan_of(opened, request.seed, request.views, clock.now())
+        if request.out:
+            check_output(scan, request.out)
+        output = Output(sink, clock, plain=not request.as_json)
+        if request.explains:
+            _explain(scan, output)
+        outputs: dict[str, object] = {}
+        if request.truth:
+            outputs |= _truth(scan, request.truth, request.truth_bin, output)
+        try:
+            written = _scan(opened, scan, request.out, output, sink) if request.out else None
+            if written:
+                outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
+            if picture and not (written and written.stopped):
+                marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
+                from beamline.features.simulate.figure import sheet  # matplotlib takes a second
+
+                write_whole(picture, sheet(scan, marked))
+                outputs |= {"picture": picture}
+                output("picture", str(picture))
+        except Exception:
+            if request.truth:
+                remove(request.truth)
+            raise
+        if written and written.stopped:
+            raise ScanStopped(
+                f"Stopped after {written.n_frames} of {len(scan)} frames; {request.out} holds them and is readable."
+            )
+        output.event(Done(outputs))
+
+
+def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
+    """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
+    from beamline.simulate.labels import labels_path
+
+    named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
+    seen: dict[str, str] = {}
+    for what, path in named.items():
+        if path is None:
+            continue
+        other = seen.setdefault(os.path.realpath(path), what)
+        if other is not what:
+            raise ConfigError(f"{path} would be both {other} and {what}; name another. Nothing was simulated.")
+        refuse_existing(path)
+
+
+def _explain(scan: Scan, output: Output) -> None:
+    from beamline.features.simulate.scene import cost_table, frame_cost
+
+    cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
+    costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]
+    output.event(CostExplained(asdict(cost_of_frame) | {"costs": costs, "machine": where}))
+    output.lines(f"{machine_line(where)}\n\n{cost_table(cost_of_frame)}")
+
+
+def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[str, object]:
+    from beamline.scenes.truth import binning_of, memory_of, truth_of, write_truth
+
+    n = binning or binning_of(scan.detector)
+    try:
+        needed, free = memory_of(scan.detector, n), free_memory()
+    except ValueError as error:
+        raise ConfigError(f"--truth-bin: {error}. Nothing was simulated.") from None
+    if needed > free:
+        raise ConfigError(
+            f"--truth-bin {n}: the truth takes {size(needed)} of memory, {size(free)} are free. Give a larger "
+            "--truth-bin. Nothing was simulated."
+        )
+    truth = truth_of(scan.scene.sample, scan.detector, n)
+    write_truth(path, truth)
+    voxels = " x ".join(map(str, truth.grid.shape))
+    output("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
+    return {"truth": path}
+
+
+def _scan(scene: SceneFile, scan: Scan, out: Path, output: Output, sink: Sink) -> SimulatedScan:
+    from beamline.features.simulate.write import write_scan
+
+    ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")
+    with ending() as stopped, Terminal(sys.stderr) as terminal:
+        written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)
+    output("scan", f"{out}  {written.n_frames} frames, {written.seconds:.1f} s")
+    events = ", ".join(f"{run.kind} in frames {run.first}-{run.last}" for run in written.runs)
+    output("labels", f"{written.labels}  {events or 'no anomaly'}")
+    return written

@@ -1,0 +1,150 @@
+"""Writes a simulated scan frame by frame into a file like an instrument's, with the labels of its anomalies."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from beamline.core.errors import DataError
+from beamline.core.events import FrameStored, Sink
+from beamline.core.files import refuse_existing
+from beamline.core.machine_speed import seconds_left
+from beamline.core.text import size
+from beamline.monitor.digest import digest
+from beamline.plan.limits import ROOM
+from beamline.scenes.scene_file import SceneFile
+from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame, FrameKind
+from drivers.orca_quest import BITS
+from simulators.effects.anomaly import Label
+from simulators.scenes.expose import PlannedFrame, Scan, expose
+
+PREVIEW_BIN = 4
+REPORT_EVERY = 0.1  # s of real time between `frame` events
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """The written files; `stopped` where the scan ended before its last frame."""
+
+    path: Path
+    labels: Path
+    n_frames: int
+    runs: tuple[LabelledRun, ...]
+    seconds: float
+    stopped: bool
+
+
+def check_output(scan: Scan, out: Path) -> None:
+    """Raises DataError where the file or its labels exist, or the disk has too little space. Nothing is written."""
+    for path in (out, labels_path(out)):
+        refuse_existing(path)
+    rows, cols = scan.detector.shape
+    preview = _preview_bin(scan.detector.shape)
+    needed = len(scan) * (2 * rows * cols + 4 * (rows // preview) * (cols // preview)) * ROOM
+    free = shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise DataError(
+            f"{out} would take {size(needed)} with {len(scan)} frames, its disk has {size(free)} free. Simulate fewer "
+            "or smaller frames, or use another disk. Nothing was written."
+        )
+
+
+def write_scan(
+    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
+) -> SimulatedScan:
+    """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
+
+    Args:
+        should_stop: called before each frame; true ends the scan with a valid file and labels.
+
+    Raises:
+        DataError: a file exists or cannot be written, or the disk is too small.
+    """
+    check_output(scan, out)
+    labels = labels_path(out)
+    log, start, reported = LabelLog(), time.monotonic(), -REPORT_EVERY
+    n = 0
+    writer = NXtomoWriter(
+        out, _info(scene, scan), scan.detector.shape, clock=clock, preview_bin=_preview_bin(scan.detector.shape)
+    )
+    try:
+        with writer:
+            for planned in scan:
+                if should_stop():
+                    writer.close("stopped")
+                    break
+                log.add(n, _write(scan, planned, n, writer))
+                n += 1
+                now = time.monotonic() - start
+                if now - reported >= REPORT_EVERY or n == len(scan):
+                    reported = now
+                    sink(replace(_progress(n, len(scan), now, scan.detector.shape, planned.kind), time=clock.now()))
+    except BaseException:
+        with suppress(DataError):  # the first error is the one to report
+            write_labels(labels, log.runs(), n)
+        raise
+    runs = log.runs()
+    write_labels(labels, runs, n)
+    return SimulatedScan(out, labels, n, runs, time.monotonic() - start, n < len(scan))
+
+
+def _write(scan: Scan, planned: PlannedFrame, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:
+    shot = planned.shot
+    counts = expose(scan.scene, shot)
+    angle = shot.angle if planned.kind is FrameKind.PROJECTION else math.nan
+    frame = Frame(counts, planned.kind, row, shot.view, shot.frame, angle, shot.time, shot.exposure)
+    writer.append(frame, digest(counts, 2**BITS - 1, _preview_bin(counts.shape)))
+    return scan.scene.chain.labels(shot)
+
+
+def _preview_bin(shape: tuple[int, int]) -> int:
+    return min(PREVIEW_BIN, *shape)
+
+
+def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: FrameKind) -> FrameStored:
+    rate = n / seconds if seconds > 0 else 0.0
+    eta = seconds_left(n, total, seconds) or 0.0
+    return FrameStored(n, total, kind.name.lower(), rate, rate * 2e-6 * math.prod(shape), eta)
+
+
+def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
+    settings, beam = scene.scene.scan, scene.scene.beam
+    chain = scene.scene.chain
+    shot, effects = scan.frame(0).shot, {effect.name for effect in chain.effects}
+    plan = {
+        "views": scan.views,
+        "range_deg": settings.range_deg,
+        "fly": settings.fly and chain.moves,
+        "seed": scan.seed,
+    }
+    magnification = 1.0 if beam.sod is None or beam.sdd is None else beam.sdd / beam.sod
+    return ScanInfo(
+        sample=scene.path.stem,
+        title=f"Simulated scan of the scene {scene.path.stem}",
+        pixel_size_mm=scan.detector.pitch * magnification,
+        source_distance_mm=beam.sod,
+        energy_kev=beam.energy_kev,
+        distance_mm=None if beam.sod is None or beam.sdd is None else beam.sdd - beam.sod,
+        exposure=scene.scene.detector.exposure_s,
+        period=scan.period,
+        axis_col=scan.detector.axis_col,
+        plan=json.dumps(plan),
+        config=scene.text,
+        saturation=2**BITS - 1,
+        devices={
+            "simulator": {
+                "seed": scan.seed,
+                "electrons_per_count": shot.conversion,
+                "row_period": shot.row_period if "rolling_shutter" in effects else 0.0,
+            }
+        },
+    )

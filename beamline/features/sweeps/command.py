@@ -1,0 +1,291 @@
+"""`beamline sweep`: one slice with each value of an option of `beamline recon`, as a sheet with scores."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamline.cli.method_options import method_with, preset_of, settings_of
+from beamline.cli.options import (
+    Declared,
+    dry_option,
+    json_events,
+    json_option,
+    name_of,
+    option,
+    refuse_contradictions,
+    rules_of,
+)
+from beamline.cli.recipe import names_given
+from beamline.cli.recon import recon
+from beamline.cli.selection_options import chosen
+from beamline.cli.terminal import counting, events_shown
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Done
+from beamline.core.files import refuse_existing, write_whole
+from beamline.core.sinks import Warnings
+from beamline.features.sweeps.values import SweptOption, combinations, swept_option
+from beamline.reconstruct.option_rules import of_other_methods
+from drivers.base.clock import SystemClock
+from recon.methods import BASELINE
+
+if TYPE_CHECKING:
+    from beamline.features.sweeps.sweep import Scores, SweptSlice
+    from beamline.reconstruct.options import ReconOptions
+
+_OF_A_VOLUME = frozenset(
+    ("output", "report", "write-config", "log", "verbose", "json", "dry-run", "max-residual", "truth", "uncertainty",
+     "roi", "follow", "earlier", "enough-loss", "enough-gain", "memory", "cluster", "checkpoint", "resume", "budget",
+     "time", "moves", "beside-scan")
+)  # fmt: skip
+"""Options of `beamline recon` that a slice has no use for."""
+
+Trials = list[tuple[Mapping[str, str], "ReconOptions"]]
+
+
+def sweepable() -> dict[str, click.Option]:
+    """The options of `beamline recon` that may have several values, by long name."""
+    own = {name_of(param): param for param in recon.params if isinstance(param, click.Option)}
+    of_one_call = {name for name, param in own.items() if isinstance(param, Declared) and param.of_one_call}
+    return {name: own[name] for name in sorted(own.keys() - _OF_A_VOLUME - of_one_call)}
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "help_option_names": ["-h", "--help"]})
+@click.argument("words", nargs=-1, type=click.UNPROCESSED, metavar="FILE|RUN NAME=VALUES [NAME=VALUES]")
+@option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="The sheet, a .png; the table of scores is beside it, a .csv. Default: FILE's stem + _sweep.png, in this "
+    "folder.",
+)
+@dry_option
+@json_option
+def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool) -> None:
+    """Reconstruct one slice of the scan in FILE with each value of an option of `beamline recon`, and draw them.
+
+    NAME is the long name of the option; VALUES are A:B:STEP or a,b,c: tv-weight=0.5:4:0.5, rings=none,sort,vo,
+    axis=84:88:0.5. Two options make a grid. All other options of `beamline recon` hold for every slice; the method is
+    fbp without -m.
+
+    One of eight views is held out, and each volume is judged by what it leaves of these. The best is marked, and those
+    that chance does not tell from it. The middle row is shown, of the rows that the method needs around it, or of
+    --rows. Ctrl-C keeps the slices that are done (exit code 4).
+    """
+    options, common = _parsed(words)
+    path = output or Path(f"{Path(common[0]).stem if common else 'scan'}_sweep.png")
+    if path.suffix.lower() != ".png":
+        raise click.UsageError(f"-o {path}: the sheet is a picture; give a name such as {path.with_suffix('.png')}.")
+    trials = _trials(options, common)
+    table = path.with_suffix(".csv")
+    refuse_existing(path)
+    refuse_existing(table)
+    if dry:
+        _print_needs(trials, path, as_json)
+        return
+    slices, scores = _run(trials, options, path, as_json)
+    if not as_json:
+        click.echo(f"{_lines(slices, scores)}\nsheet     {path}\ntable     {table}")
+        if scores is not None:
+            best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
+            again = shlex.join(["beamline", "recon", *common, *best])
+            click.echo(f"If the pictures agree: {again}", err=True)
+    if len(slices) < len(trials):
+        raise ScanStopped(f"The sweep was stopped after {len(slices)} of {len(trials)} slices; {path} holds them.")
+
+
+def _parsed(words: Sequence[str]) -> tuple[list[SweptOption], list[str]]:
+    """The options with their values, and the words of `beamline recon` that are the same for all, its scan first."""
+    with click.Context(recon, info_name="sweep") as context:
+        taken, further, _ = recon.make_parser(context).parse_args(list(words))
+    if (file := taken.get("file")) is None or not further:
+        raise click.UsageError("give a scan, and an option with its values, such as tv-weight=0.5:4:0.5.")
+    rest = list(words)
+    for word in (str(file), *further):
+        rest.remove(word)
+    try:
+        options = [swept_option(word, sweepable()) for word in further]
+        combinations(options)
+    except ValueError as error:
+        raise click.UsageError(f"{error}.") from error
+    return options, [str(file), *rest]
+
+
+def _as_words(name: str, value: str) -> list[str]:
+    """An option with a value, as `beamline recon` takes it. UsageError: a flag that is neither on nor off."""
+    switch = sweepable()[name]
+    if not switch.is_flag:
+        return [f"--{name}={value}"]
+    if value not in ("true", "false"):
+        raise click.UsageError(f"{name}={value}: it is on or off; expected {name}=false,true.")
+    names = switch.opts if value == "true" else switch.secondary_opts
+    return [max(names, key=len)] if names else []
+
+
+def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
+    """Each combination of values with the options of its reconstruction. UsageError: values that are not taken, or that
+    change nothing."""
+    trials: Trials = []
+    for values in combinations(options):
+        own = [word for item in values.items() for word in _as_words(*item)]
+        with recon.make_context("sweep", [*common, *own]) as context:
+            trials.append((values, _options(context)))
+        if len(trials) == 1:
+            with recon.make_context("sweep", list(common)) as alone:
+                twice = names_given(alone) & values.keys()
+            if twice:
+                raise click.UsageError(f"--{min(twice)} is swept: give its values once.")
+    told = [
+        (repr((each.source, each.selection, each.method)), each.quality, each.seed, each.device) for _, each in trials
+    ]
+    if all(each == told[0] for each in told[1:]):
+        names = " and ".join(option.name for option in options)
+        raise click.UsageError(f"{names} changes nothing of a slice by {trials[0][1].method.name}.")
+    return trials
+
+
+def _options(context: click.Context) -> ReconOptions:
+    """The options of one reconstruction."""
+    from beamline.reconstruct.options import ReconOptions
+    from beamline.reconstruct.output_paths import OutputPaths
+
+    values, given = dict(context.params), names_given(context)
+    if foreign := sorted(given & _OF_A_VOLUME):
+        raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
+    refuse_contradictions(recon, given)
+    method = preset_of(values["method"], values["preset"]) or BASELINE
+    if why := of_other_methods(rules_of(recon), given, method, stated=values["method"] is not None):
+        raise click.UsageError(why)
+    source, selection = chosen(values["file"], values["seed"], values)
+    settings = settings_of(recon, values) | {"filter": values["filter"]}
+    return ReconOptions(
+        source=source,
+        target=OutputPaths(Path("slice.h5"), None, written=False),
+        selection=selection,
+        method=method_with(method, settings, values["any_setting"]),
+        quality=values["quality"],
+        device=values["device"],
+        filter=values["filter"],
+        seed=values["seed"],
+        unfinished=values["unfinished"],
+    )
+
+
+def _run(
+    trials: Trials, options: Sequence[SweptOption], path: Path, as_json: bool
+) -> tuple[list[SweptSlice], Scores | None]:
+    """Write the sheet and the table of the slices, as far as they were made."""
+    from beamline.features.sweeps.sheet import sweep_sheet
+    from beamline.features.sweeps.sweep import scores_of, sliced, sweep_slices
+
+    slices: list[SweptSlice] = []
+    first = trials[0][1]
+    with events_shown(as_json) as sink:
+        clock = SystemClock()
+        warn = Warnings(sink, clock)
+        with sliced([each for _, each in trials]) as cut:
+            planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
+            try:
+                for each in sweep_slices(planned, sink, clock, counting("slices", sink, clock)):
+                    slices.append(each)
+            except KeyboardInterrupt:
+                if not slices:
+                    raise
+            rows = cut[0].selection.rows
+        scores = scores_of(slices)
+        for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
+            warn(sentence)
+        where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
+        title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
+        write_whole(path.with_suffix(".csv"), table_of(slices, scores))
+        write_whole(path, sweep_sheet(slices, scores, options, title))
+        best = None if scores is None else dict(slices[scores.best].values)
+        means = None if scores is None else scores.means.tolist()
+        sink(Done({"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means},
+                  time=clock.now()))  # fmt: skip
+    return slices, scores
+
+
+def _remarks(
+    slices: Sequence[SweptSlice], scores: Scores | None, options: Sequence[SweptOption], *, direct: bool
+) -> list[str]:
+    if scores is None:
+        return ["No score: the values change pixels or views, so the slices cannot be compared with the same views."]
+    remarks = []
+    if direct:
+        remarks.append(
+            f"What {BASELINE} leaves of views is mostly the blur of its filter; -m fista-tv tells values apart better."
+        )
+    if not scores.corrected_alike:
+        remarks.append(
+            "These values change the views that judge the slices: each is compared with the views of every value. "
+            "One that all others contradict loses, and the middle of a range is favoured. Look at the pictures first."
+        )
+    best = slices[scores.best].values
+    for each in options if len(slices) == math.prod(len(each.values) for each in options) else ():
+        ends = (each.values[0], each.values[-1]) if each.numbers and len(each.values) > 2 else ()
+        if scores.corrected_alike and best[each.name] in ends:
+            remarks.append(f"The best {each.name} is at the end of the range, {best[each.name]}: try further.")
+    return remarks
+
+
+def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
+    """CSV: values, the residual of views held out, whether the slice is the best one or alike, and seconds."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow([*slices[0].values, "residual_held_out", "verdict", "seconds"])
+    for n, each in enumerate(slices):
+        residual = "" if scores is None else f"{scores.means[n]:.6g}"
+        writer.writerow([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
+    return out.getvalue()
+
+
+def _verdict(scores: Scores | None, n: int) -> str:
+    if scores is None or not scores.alike[n]:
+        return ""
+    return "best" if n == scores.best else "alike"
+
+
+def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
+    names = list(slices[0].values)
+    head = [*names, "residual of views held out", "", "s"]
+    rows = [head]
+    for n, each in enumerate(slices):
+        residual = "-" if scores is None else f"{scores.means[n]:.5g}"
+        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
+    widths = [max(len(row[at]) for row in rows) for at in range(len(head))]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
+    """Print the time and memory of the sweep."""
+    from beamline.core.machine_speed import MachineSpeed
+    from beamline.core.need import Need
+    from beamline.core.text import count, size
+    from beamline.features.sweeps.sweep import sliced
+    from beamline.reconstruct.estimate import estimate
+    from recon.assess.time_model import duration_text
+
+    with json_events(as_json) as sink:
+        speed = MachineSpeed()
+        with sliced([each for _, each in trials]) as cut:
+            needs = [estimate(each, speed) for each in cut]
+        together = Need.in_turn(needs)
+        total = None if any(each.seconds is None for each in needs) else together.seconds
+        facts: dict[str, Any] = {"slices": len(needs), "memory": together.memory, "seconds": total}
+        sink(Done({**facts, "output": str(path)}, time=SystemClock().now()))
+    if not as_json:
+        time = "not known" if total is None else f"about {duration_text(total)} at most"
+        one = needs[0]
+        click.echo(
+            f"slices    {len(needs)}, each of {count(one.shape[0], 'row')} by {one.method}, from {one.views} views\n"
+            f"memory    {size(facts['memory'])}\ntime      {time}, reading and correction not counted\n"
+            f"sheet     {path}"
+        )

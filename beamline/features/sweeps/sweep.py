@@ -1,0 +1,233 @@
+"""Sweep: the same slice with each value of one or two options, and how well each volume predicts views held out."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.events import Sink
+from beamline.core.sinks import Warnings
+from beamline.projections.held_out import hold_out
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.reconstruct.job import compile_kernels, run_on
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.progress import progress_events
+from beamline.storage.readers.base import ScanSource
+from drivers.base.clock import Clock
+from recon.base.arrays import F32, F64
+from recon.base.empirical import ONE_IN
+from recon.base.method import Reconstruction, RunControl
+from recon.base.volume import Grid
+from recon.voxels.held_out import beyond_chance, residuals_by_view
+from recon.voxels.projector import Projector
+
+_TALLEST = 16  # rows of a slab around the slice, as of trials of a method
+
+
+@dataclass(frozen=True, eq=False)
+class SweptSlice:
+    """The slice with one value of each option.
+
+    Attributes:
+        values: of the options, by name.
+        image: [y, x] in 1/mm (1/px), the middle slice of the rows.
+        seconds: of the reconstruction.
+        views: its views held out, corrected as its own options say.
+        projected: [view, row, col] what the volume shows in them.
+    """
+
+    values: Mapping[str, str]
+    image: F32
+    seconds: float
+    views: HeldOutViews
+    projected: F32
+
+    @property
+    def label(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self.values.items())
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutViews:
+    """Views that no volume of the sweep has learnt from: rows of the file, and line integrals [view, row, col]."""
+
+    ids: NDArray[np.int64]
+    data: F32
+    prepared: PreparedProjections
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How well each slice's volume predicts views held out.
+
+    Attributes:
+        residuals: [slice, view] root mean square, as a share of the views' own.
+        corrected_alike: all options give the same views; else each volume is compared with the views by all of them.
+    """
+
+    residuals: F64
+    corrected_alike: bool
+
+    @property
+    def means(self) -> F64:
+        return np.asarray(self.residuals.mean(axis=1))
+
+    @property
+    def best(self) -> int:
+        return int(np.argmin(self.means))
+
+    @property
+    def alike(self) -> list[bool]:
+        """Which slices are told from the best one by no more than chance; also the best one itself."""
+        best = self.residuals[self.best]
+        return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
+
+
+@contextmanager
+def sliced(trials: Sequence[ReconOptions]) -> Iterator[list[ReconOptions]]:
+    """The same reconstructions of a few rows around the middle, with no output.
+
+    A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
+    are given, all of them are made.
+
+    Raises:
+        ConfigError, DataError: a scan or a selection that is refused.
+    """
+    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
+    with tempfile.TemporaryDirectory(prefix="beamline-") as folder:
+        target = OutputPaths(Path(folder) / "slice.h5", None, written=False)
+        cut = []
+        for trial in trials:
+            with trial.source.open() as source:
+                selection = _middle(source, trial.selection, halo)
+            cut.append(replace(trial, target=target, selection=selection))
+        yield cut
+
+
+def _middle(source: ScanSource, selection: Selection, halo: int) -> Selection:
+    rows, n = rows_of(source, selection), selection.binning
+    if selection.rows is not None or cone_of(source, selection) is not None:
+        return selection
+    height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
+    first = rows.start + (rows.stop - rows.start - height) // 2
+    return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))
+
+
+def sweep_slices(
+    trials: Sequence[tuple[Mapping[str, str], ReconOptions]],
+    sink: Sink,
+    clock: Clock,
+    progress: Callable[[int, int], None],
+) -> Iterator[SweptSlice]:
+    """Each slice in turn. Views are corrected once for all values that leave them alike.
+
+    The rotation axis is found once, so that slices differ by the options alone; where it is swept, views are corrected
+    about the axis in the middle.
+
+    Raises:
+        ConfigError, DataError: see `beamline recon`.
+    """
+    warn, first = Warnings(sink, clock), repr(trials[0][1].source)
+    axis = middle_axis([options.selection for _, options in trials])
+    of_axes = axis is not None
+    selected: tuple[str, Selection] | None = None
+    progress(0, len(trials))
+    for n, (values, options) in enumerate(trials, 1):
+        asked, source_words = options.selection, repr(options.source)
+        wanted = asked
+        if of_axes or (asked.axis_col is None and source_words == first):
+            wanted = replace(asked, axis_col=axis)
+        if selected != (source_words, wanted):
+            with options.source.open() as source:
+                views = _held_out(prepare_projections(source, wanted, warn))
+            if wanted.axis_col is None and source_words == first:
+                axis = views.prepared.axis_col
+                wanted = replace(wanted, axis_col=axis)
+            selected = source_words, wanted
+        own = views.prepared if asked.axis_col is None or not of_axes else _about(views.prepared, asked)
+        made = swept_slice(options, own, Grid.matching(views.prepared.geometry), sink, clock)
+        assert own.held_out is not None
+        projected = Projector(own.held_out[1], made.volume.grid).forward(np.asarray(made.volume.data))
+        image = np.array(made.volume.data[made.volume.data.shape[0] // 2])
+        yield SweptSlice(values, image, made.seconds, views, projected)
+        progress(n, len(trials))
+
+
+def swept_slice(
+    options: ReconOptions, prepared: PreparedProjections, grid: Grid, sink: Sink, clock: Clock
+) -> Reconstruction:
+    compile_kernels(options, prepared.geometry, sink, clock)
+    control = RunControl(on_progress=progress_events(sink, clock), now=clock.now)
+    return run_on(options, options.method_for(prepared.geometry), prepared, grid, control)
+
+
+def middle_axis(selections: Sequence[Selection]) -> float | None:
+    """The axis by which all views are corrected where the axis itself is swept; None where it is not.
+
+    Corrections look at views on both sides of the axis: with each its own, some would correct and others not.
+    """
+    axes = sorted(each.axis_col for each in selections if each.axis_col is not None)
+    return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
+
+
+def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProjections:
+    """The same views about the axis of the selection."""
+    assert prepared.held_out is not None and selection.axis_col is not None
+    data, unseen = prepared.held_out
+    n = selection.binning
+    axis_col = (selection.axis_col - (n - 1) / 2) / n
+    return replace(
+        prepared,
+        geometry=replace(prepared.geometry, axis_col=axis_col),
+        axis_col=selection.axis_col,
+        held_out=(data, replace(unseen, axis_col=axis_col)),
+    )
+
+
+def _held_out(prepared: PreparedProjections) -> HeldOutViews:
+    held = hold_out(prepared, ONE_IN, advice="take a scan with more views")
+    assert held.held_out is not None and held.held_out_ids is not None
+    data = np.array(held.held_out[0], np.float32)
+    if held.measured is not None:
+        data[:, ~held.measured] = np.nan
+    return HeldOutViews(held.held_out_ids, data, held)
+
+
+def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
+    """How well each volume predicts the views that none has learnt from; None where their pixels, or views, differ.
+
+    A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
+    compared with them as every value corrects them, and the mean counts.
+    """
+    shapes = {each.views.data.shape[1:] for each in slices}
+    common = slices[0].views.ids
+    for each in slices[1:]:
+        common = np.intersect1d(common, each.views.ids)
+    if len(shapes) > 1 or not common.size:
+        return None
+    judges = list({id(each.views): each.views for each in slices}.values())
+    residuals = np.zeros((len(slices), common.size))
+    scale, alike, first = 0.0, True, slices[0].views
+    for judge in judges:
+        measured = judge.data[np.searchsorted(judge.ids, common)]
+        scale += float(np.sqrt(np.nanmean(np.square(measured, dtype=np.float64))))
+        alike &= np.array_equal(measured, first.data[np.searchsorted(first.ids, common)], equal_nan=True)
+        for n, each in enumerate(slices):
+            differences = each.projected[np.searchsorted(each.views.ids, common)] - measured
+            by_view = residuals_by_view(differences, measured, each.views.prepared.geometry)
+            if by_view.size != common.size:
+                return None
+            residuals[n] += by_view
+    if scale == 0:
+        raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
+    return Scores(residuals / scale, alike)

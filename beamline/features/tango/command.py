@@ -1,0 +1,54 @@
+"""`beamline tango`: the running scan as a Tango device."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import click
+
+from beamline.cli.options import parsed, say
+from beamline.core.files import RUNS
+
+
+def device_name(value: str) -> str:
+    """A name with the three parts that Tango's names have. ValueError for another one."""
+    if not re.fullmatch(r"[\w.-]+(/[\w.-]+){2}", value):
+        raise ValueError(f"{value!r} is no name of a device; expected DOMAIN/FAMILY/MEMBER, such as id19/tomo/scan")
+    return value
+
+
+_NAME: Callable[..., str] = parsed(device_name)
+
+
+@click.command()
+@click.argument("runs", required=False, default=RUNS, type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--device", default="splatline/scan/1", show_default=True, callback=_NAME, metavar="NAME", help="Its name."
+)
+@click.option(
+    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
+)
+@click.option(
+    "--port", default=10100, show_default=True, type=click.IntRange(1024, 65535),
+    help="TCP port to listen at.",
+)  # fmt: skip
+@click.option(
+    "--instance", metavar="NAME",
+    help="Serve the devices that the database at TANGO_HOST holds for the server splatline/NAME; --device is not used.",
+)  # fmt: skip
+@click.option("--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan.")
+def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, control: bool) -> None:
+    """Serve the newest run of the folder RUNS (default ./runs) as a Tango device.
+
+    It only reads the run's files, so that it cannot slow a scan down. Tango has no passwords: with --control everybody
+    who reaches the address may end a scan. Needs: pip install "splatline[tango]".
+
+    Exit code: 0 ended by Ctrl-C, 2 pytango is not installed, 5 the address cannot be listened at, or the database does
+    not answer.
+    """
+    from beamline.features.tango.device import ServerPlace, serve
+
+    place = ServerPlace(bind, port, device, instance)
+    serve(runs, place, control, say, lambda: click.echo(f"{place} (docs/tango.md). Ctrl-C ends this, not the scan."))

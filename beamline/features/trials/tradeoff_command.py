@@ -1,0 +1,189 @@
+"""`beamline tradeoff`: compares methods and settings on a scan by quality, time and memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.method_options import equal_time
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
+from beamline.cli.options import (
+    POSITIVE,
+    dry_option,
+    json_option,
+    names_in,
+    new_folder_option,
+    others,
+    parsed,
+    refuse_contradictions,
+    seed_option,
+    set_by,
+    unknown_method,
+    with_request,
+)
+from beamline.cli.recipe import names_given, repeating
+from beamline.cli.scan_options import light_asked, light_options
+from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.terminal import events_shown
+from beamline.core.errors import ScanStopped
+from drivers.base.clock import SystemClock
+from recon.methods import names_compared, names_of_one_volume
+
+
+def listed(value: str) -> tuple[str, ...]:
+    """Names of methods, separated by commas. ValueError for another name."""
+    wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
+    if others := [name for name in wanted if name not in names_of_one_volume()]:
+        raise ValueError(unknown_method(others[0], names_of_one_volume()))
+    return wanted
+
+
+_OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each energy."
+
+
+@dataclass(frozen=True, eq=False)
+class TradeoffRequest:
+    """What `beamline tradeoff` is asked for."""
+
+    files: tuple[Path, ...] = set_by(
+        heading(DATA),
+        click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
+    )
+    truth: str | None = set_by(
+        "--truth",
+        excludes=dict.fromkeys(
+            ("time", "spectra"), "it is one volume; views in time, or of several energies, show several"
+        ),
+        metavar="FILE[:A:B]",
+        help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views "
+        "held out.",
+    )
+    values: Mapping[str, Any] = others(light_options, selection_options)
+    volumes: int | None = set_by(
+        heading(METHOD),
+        "--time",
+        excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
+        type=click.IntRange(min=2),
+        metavar="N",
+        help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
+    )
+    spectra: Path | None = set_by(
+        "--spectra",
+        type=click.Path(path_type=Path, dir_okay=False),
+        help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
+    )
+    states: str = set_by(
+        "--states",
+        needs=("spectra", _OF_MATERIALS),
+        metavar="NAME,NAME",
+        default="",
+        help="With --spectra: two materials that are two states of the same one.",
+    )
+    methods: tuple[str, ...] | None = set_by(
+        "--methods",
+        callback=parsed(listed),
+        metavar="A,B,...",
+        help=f"Methods to compare, of {', '.join(names_of_one_volume())}. "
+        f"Default: all but {', '.join(name for name in names_of_one_volume() if name not in names_compared())}; "
+        "of an emission also mlem and osem.",
+    )
+    quick: bool = set_by(
+        "--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones."
+    )
+    seconds: float | None = set_by(equal_time)
+    max_seconds: float | None = set_by(
+        heading(RESOURCES),
+        "--max-seconds",
+        type=POSITIVE,
+        help="Wall time of the whole command. Each method comes first once, without half-set resolution; a trial that "
+        "would not fit is not begun.",
+    )
+    dry: bool = set_by(dry_option)
+    seed: int = set_by(heading(METHOD), seed_option)
+    output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem + _tradeoff"))
+    as_json: bool = set_by(json_option)
+
+
+@click.command(
+    cls=Grouped,
+    first=(
+        "methods",
+        "quick",
+        "seconds",
+        "max_seconds",
+        "truth",
+        "views",
+        "rows",
+        "binning",
+        "output",
+        "dry",
+    ),
+)
+@with_request(TradeoffRequest)
+def tradeoff(request: TradeoffRequest) -> None:
+    """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
+
+    With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
+    beside reconstructions of parts of them. With --seconds: each method once, all in the same time.
+
+    Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
+    resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
+    HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
+    """
+    begun = time.monotonic()  # before libraries are loaded, which takes seconds
+    from beamline.core.sinks import Warnings
+    from beamline.energies.scans import EnergyScans
+    from beamline.energies.spectra import read_spectra
+    from beamline.features.trials.front import TRADEOFF
+    from beamline.features.trials.layout import text
+    from beamline.features.trials.runner import ComparedScan
+    from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
+    from beamline.scan.energies import scans_of
+
+    context, files = click.get_current_context(), request.files
+    refuse_contradictions(context.command, names_given(context))
+    if request.spectra is None and len(files) > 1:
+        raise click.UsageError(f"A comparison of {len(files)} files {_OF_MATERIALS}")
+    folder = request.output or Path(f"{files[0].stem}_tradeoff")
+    with events_shown(request.as_json) as sink:
+        if request.spectra is not None:
+            files = scans_of(files, Warnings(sink, SystemClock()))
+        (source, selection), *others = (chosen(path, request.seed, request.values) for path in files)
+        scans = None
+        if request.spectra is not None:
+            scans = EnergyScans((source, *(each for each, _ in others)), read_spectra(request.spectra))
+        options = TradeoffOptions(
+            scan=ComparedScan(
+                source,
+                selection,
+                folder,
+                request.truth,
+                light_asked(request.values["photons_per_count"], request.values["dose_in"]),
+            ),
+            methods=request.methods or (),
+            several=SeveralVolumes(request.volumes or 0, scans, names_in(request.states)),
+            depth="quick" if request.quick else "full",
+            max_seconds=request.max_seconds,
+            seconds=request.seconds,
+            seed=request.seed,
+            command=repeating(context, files, folder),
+        )
+        if not request.dry:
+            table = run_tradeoff(options, sink, SystemClock(), begun=begun)
+    if request.dry:
+        from beamline.features.trials.dry_run import print_dry_run  # here: help needs none of it
+
+        print_dry_run(partial(planned_tradeoff, options), folder, request.as_json)
+        return
+    if not request.as_json:
+        click.echo(text(table, TRADEOFF))
+        click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
+    if table.stopped:
+        counts = f"{table.n_done} of {len(table.outcomes)}"
+        raise ScanStopped(f"The trade-off was stopped after {counts} trials; {folder} holds them.")

@@ -1,0 +1,326 @@
+"""One trial in a process of its own, so that its peak memory is its own.
+
+`python -m beamline.features.trials.worker JOB.json` reads the job and its arrays, and says progress and the result as
+lines of JSON on stdout. A job may also be to compile what trials will need, once for all of them: compiling takes
+memory that would otherwise count as the first trial's. Its stdin is a pipe that nothing is written to: when it ends,
+the parent process has ended, and this one ends, too.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+import recon
+from beamline.core.errors import DataError
+from beamline.core.machine import peak_memory, reset_peak_memory
+from beamline.core.process import at_end_of
+from beamline.features.trials.data import TrialData, VolumeAt, by_parts, geometry_in, write_array
+from beamline.features.trials.trial import Trial
+from beamline.projections.held_out import with_held_out
+from beamline.report.record import history_arrays, residual_curve
+from recon.assess import metrics
+from recon.assess.time_model import record
+from recon.base.arrays import F32, F64, I64
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.method import DataUse, RunControl
+from recon.base.views import parse_views
+from recon.base.volume import Grid, Volume
+from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
+from recon.reconstruction import Reconstruction
+from recon.voxels.projector import project
+from recon.warm_up import warm_up
+
+Say = Callable[[Mapping[str, Any]], None]
+
+_SAY_EVERY = 0.5  # s
+
+
+def run(
+    trial: Trial,
+    data: TrialData,
+    seed: int,
+    say: Say,
+    now: Callable[[], float] = time.perf_counter,
+    cpu: Callable[[], float] = time.process_time,
+    keep: Path | None = None,
+) -> dict[str, Any]:
+    """Make a trial's reconstruction and measure it; the fields of an Outcome.
+
+    Args:
+        keep: a .npy file to leave the volume in; None: it is measured and forgotten.
+
+    Raises:
+        ValueError: the reconstruction refuses these settings.
+        DataError: the disk did not take the volume.
+    """
+    if trial.choice is not None:
+        projections, geometry, use = data.chosen(trial.choice)
+    else:
+        views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
+        projections, geometry = data.projections[views], data.geometry.select(views)
+        use = _of_views(data.use, views, geometry)
+    seen, unseen_rays = use, data.rays_held_out
+    if use.weights is not None and unseen_rays is not None:
+        seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
+    grid, result, judged, warned = Grid.matching(data.geometry), None, None, list[warnings.WarningMessage]()
+    ready(trial, data.geometry)
+    reset_peak_memory()
+    before, began = cpu(), now()
+    if trial.parts > 1:
+        volume_at = _of_parts(trial, data, grid, seed)
+    else:
+        control = ended_in_time(trial, now, _progress(say, now))
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always", UserWarning)
+            result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, control, seen)
+        volume_at = result.at or partial(_always, on_grid(result.volume, grid).data)
+        judged = residual_curve(history_arrays(result.history))
+    cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
+    peak = peak_memory()  # before measuring, which has needs of its own
+    figures, squared = measured(volume_at, data, grid, keep)
+    if trial.halves and trial.views >= 4:
+        figures["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
+    return {
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "peak_bytes": peak,
+        "metrics": {name: float(value) for name, value in figures.items()},
+        "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
+        "squared_residuals": squared,
+        "curve": [] if result is None else curve_of(result),
+        "curve_of": "" if judged is None else judged.views,
+        "reached": "" if result is None else reached(result),
+        "message": "; ".join(dict.fromkeys(str(one.message) for one in warned)),
+    }
+
+
+def measured(
+    volume_at: VolumeAt, data: TrialData, grid: Grid, keep: Path | None
+) -> tuple[dict[str, float], list[float]]:
+    """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
+    n, figures, squared = data.geometry.n_views, dict[str, float](), list[float]()
+    middle = volume_at(float(np.sort(data.shown[:n])[n // 2]))
+    if keep is not None:
+        write_array(keep, middle)
+    if data.truth is not None:
+        figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
+        if data.emission is not None:
+            figures |= metrics.contrast(data.truth, middle)
+    if data.reference is not None:
+        figures["psnr_fbp"] = metrics.psnr(data.reference, middle)
+        figures["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
+    if data.regions is not None:
+        figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
+    if data.held_out is not None:
+        unseen, geometry = data.held_out
+        root = np.float32(1) if data.rays_held_out is None else np.sqrt(data.rays_held_out)
+        off = root * (shown(volume_at, data.shown[n:], geometry, grid) - unseen)
+        if (scale := float(np.linalg.norm(root * unseen))) == 0:
+            raise ValueError("the views held out are all zero, so there is nothing to explain")
+        figures["residual_held_out"] = float(np.linalg.norm(off)) / scale
+        squared = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
+    return figures, squared
+
+
+def _always(volume: F32, key: float) -> F32:
+    """The one volume, whenever a view was taken."""
+    return volume
+
+
+def ready(trial: Trial, geometry: Geometry) -> None:
+    """Load what the trial needs, on a toy of the same kind, so that compilation is in no trial's time.
+
+    Raises:
+        ValueError: the method does not take such views.
+    """
+    warm_up(trial.build(), geometry)
+
+
+def _of_parts(trial: Trial, data: TrialData, grid: Grid, seed: int) -> VolumeAt:
+    def fit(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
+        use = DataUse(weights)
+        control = ended_in_time(trial)
+        return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, control, use).volume, grid).data
+
+    return by_parts(trial.parts, data, fit)
+
+
+def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
+    """Line integrals [view, row, col] of the volume that each view shows, by its time or the number of its energy."""
+    lines = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
+    for key in np.unique(of_view):
+        at = np.flatnonzero(of_view == key)
+        lines[at] = project(Volume(volume_at(float(key)), grid), geometry.select(at))
+    return lines
+
+
+def half_set_resolution(
+    trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int, use: DataUse
+) -> float:
+    """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
+    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+
+    def half(views: NDArray[np.int64]) -> F32:
+        some, control = geometry.select(views), ended_in_time(trial)
+        result = reconstruct(trial, projections[views], some, grid, None, seed, control, _of_views(use, views, some))
+        return on_grid(result.volume, grid).data
+
+    even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
+    return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
+
+
+def _of_views(use: DataUse, views: I64, geometry: Geometry) -> DataUse:
+    """What is known of these views, which `geometry` is of."""
+    emission = None if use.emission is None else use.emission.summed(views[:, None], geometry)
+    times, energies = use.times, use.energies
+    return DataUse(
+        None if use.weights is None else use.weights[views],
+        (),
+        emission,
+        None if times is None else times[views],
+        None if energies is None else replace(energies, of_view=energies.of_view[views]),
+    )
+
+
+def reconstruct(
+    trial: Trial,
+    projections: F32,
+    geometry: Geometry,
+    grid: Grid,
+    held_out: tuple[F32, Geometry] | None,
+    seed: int,
+    control: RunControl,
+    use: DataUse,
+) -> Reconstruction:
+    """The one place that turns a trial into a call of recon.reconstruct.
+
+    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel. Weights
+    of `use` are of the views, and of those held out after them; it names no views held out.
+    """
+    method, unseen, weights = trial.build(), list[int](), use.weights
+    if method.traits.held_out:
+        projections, geometry, unseen = with_held_out(projections, geometry, held_out)
+    if weights is not None:
+        weights = weights[: len(projections)]
+        if trial.binning > 1:
+            projections, weights = masked(projections, weights)[0], bin_views(weights, trial.binning)
+    use = DataUse(
+        weights,
+        unseen,
+        use.emission if trial.binning == 1 and not unseen else None,
+        use.times if method.traits.in_time else None,
+        use.energies if method.traits.by_energy else None,
+    )
+    binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
+    target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
+    return recon.reconstruct(binned, coarse, method, grid=target, seed=seed, use=use, control=control)
+
+
+def ended_in_time(
+    trial: Trial,
+    now: Callable[[], float] = time.perf_counter,
+    on_progress: Callable[[recon.Progress], None] | None = None,
+) -> RunControl:
+    """The control of a reconstruction that begins now, and ends when the trial's seconds, if any, are over."""
+    control = RunControl(on_progress=on_progress, now=now)
+    return control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
+
+
+def reached(result: Reconstruction) -> str:
+    """Steps or iterations done, and sweeps on voxels after a fit; empty for a direct method."""
+    if not result.history:
+        return ""
+    word = next((each for each in ("iteration", "sweep") if f"{each}s" in result.settings), "step")
+    done = [(result.history[-1].step, word), (result.settings.get("finish", 0), "sweep")]
+    return ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in done if n or word != "sweep")
+
+
+def on_grid(volume: Volume, grid: Grid) -> Volume:
+    """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
+    if volume.grid == grid:
+        return volume
+    index = [
+        (there - here[0]) / edge
+        for there, here, edge in zip(grid.coordinates(), volume.grid.coordinates(), volume.grid.spacing, strict=True)
+    ]
+    out = np.empty(grid.shape, np.float32)
+    plane = np.meshgrid(index[1], index[2], indexing="ij")
+    for k, height in enumerate(index[0]):
+        where = np.stack((np.full_like(plane[0], height), *plane))
+        ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
+    return Volume(out, grid)
+
+
+def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
+    """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
+    curve = residual_curve(history_arrays(result.history))
+    if curve is None:
+        return []
+    seconds, quality = record(curve.seconds, curve.residuals)
+    return list(zip(seconds.tolist(), quality.tolist(), strict=True))
+
+
+def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
+    reported = -math.inf
+
+    def on_progress(progress: recon.Progress) -> None:
+        nonlocal reported
+        if now() - reported >= _SAY_EVERY:
+            reported = now()
+            say({"event": "progress", "step": progress.step, "steps": progress.steps})
+
+    return on_progress
+
+
+def main(job: Path) -> int:
+    """Run the job in the file `job`.
+
+    That is {"data": folder, "trial": {...}, "seed": n, "keep": .npy or null}, or
+    {"data": folder, "compile": [{...}, ...]}.
+    """
+
+    def say(line: Mapping[str, Any]) -> None:
+        print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
+
+    request = json.loads(job.read_text(encoding="utf-8"))
+    if "compile" in request:
+        geometry = geometry_in(Path(request["data"]))
+        for trial in request["compile"]:
+            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
+                ready(Trial.of_job(trial), geometry)
+        return 0
+    trial = Trial.of_job(request["trial"])
+    keep = request.get("keep")
+    try:
+        data = TrialData.load(Path(request["data"]))
+        result = run(trial, data, int(request["seed"]), say, keep=None if keep is None else Path(keep))
+    except ValueError as error:
+        say({"event": "failed", "message": str(error)})
+        return 1
+    except DataError as error:  # the disk
+        say({"event": "failed", "message": str(error)})
+        return error.exit_code
+    say({"event": "result", **result})
+    return 0
+
+
+if __name__ == "__main__":
+    at_end_of(sys.stdin.fileno(), lambda: os._exit(1))
+    sys.exit(main(Path(sys.argv[1])))

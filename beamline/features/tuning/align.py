@@ -1,0 +1,144 @@
+"""Align: a pair of views half a turn apart before a scan: where the axis is, how it leans, and how sharp views are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from beamline.config.load import Config, plan_of
+from beamline.core.errors import ConfigError, QualityError
+from beamline.core.events import Sink
+from beamline.core.stop import StopRequest
+from beamline.core.text import degrees
+from beamline.features.tuning.tune import mean_counts, static_block, take
+from beamline.instrument.connect import ConnectedDevices
+from beamline.plan.plan import Block, Mode
+from drivers.base.frame import Frame, FrameKind
+from recon.features.tuning.pair import align_pair, finest_structure
+from recon.prep.align import AxisError
+
+N = 4
+"""Darks, and flats."""
+TWICE = 2
+"""Frames of each view, whose noise differs and whose structure does not."""
+STRAIGHT = 0.5
+"""Columns: a smaller offset of the axis, or lean over the frame's height, is not corrected."""
+_ROUNDING = 1e-9  # rad
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What the pair says. Lengths in mm are at the sample, angles in rad."""
+
+    axis_col: float  # column of the axis at the middle row
+    offset: float  # columns from the frame's middle to the axis; positive to the right, where columns are higher
+    offset_mm: float
+    tilt: float  # the axis' column grows by tan(tilt) a row; NaN: not known
+    uncertainty: float  # of the tilt, one standard deviation
+    detail: float  # pixels over which views change, without noise: smaller is sharper; NaN: only noise
+    angle: float  # of the first view
+    rows: int  # of the frame
+
+    @property
+    def lean(self) -> float:
+        """Columns between the axis at the first row and at the last."""
+        return math.tan(self.tilt) * (self.rows - 1)
+
+    def lines(self) -> list[str]:
+        """Lines of text, with the correction of each."""
+        side, way = ("right", "lower") if self.offset > 0 else ("left", "higher")
+        move = f"; move the axis {abs(self.offset_mm):.4g} mm towards {way} columns, or set"
+        axis = (
+            f"column {self.axis_col:.2f}, {abs(self.offset):.2f} px = {abs(self.offset_mm):.4g} mm {side} of the middle"
+            f"{move if abs(self.offset) > STRAIGHT else ':'} optics.axis_col={self.axis_col:.2f}"
+        )
+        if math.isnan(self.tilt):
+            tilt = "not known: too few bands of rows show the sample"
+        else:
+            turn, sure = math.degrees(self.tilt), math.degrees(self.uncertainty)
+            tilt = f"{turn:.3f}° ± {sure:.3f}°, {abs(self.lean):.2f} px from first to last row; "
+            way = "clockwise" if turn > 0 else "anticlockwise"  # the axis' foot is right of its head
+            turned = f"turn the axis {abs(turn):.3f}° {way} as the frame shows it, or the camera the other way"
+            tilt += turned if abs(self.lean) > STRAIGHT else "no correction"
+        detail = (
+            "not known: the view is only noise"
+            if math.isnan(self.detail)
+            else (
+                f"{self.detail:.3g} px over which the view at {degrees(self.angle)} changes; focus until it is smallest"
+            )
+        )
+        return [f"{name:<8}{text}" for name, text in (("axis", axis), ("tilt", tilt), ("detail", detail))]
+
+
+def align(
+    config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
+) -> Alignment:
+    """Take darks, flats and two views half a turn apart, and evaluate them. Nothing is written.
+
+    At the end the shutter is closed and stage and sample are where they were, as after a scan.
+
+    Args:
+        angle: rad, of the first view; None: the first of the plan, or half a turn before it where limits want that.
+
+    Raises:
+        ConfigError: the stage does not go to both angles.
+        QualityError: the views show no axis.
+        ScanStopped: it was requested. InstrumentError, DeviceError: a device failed.
+    """
+    plan, limits = plan_of(config), instrument.devices.stage.limits
+    first = float(plan.angles[0]) if angle is None else angle
+    pair = [first, first + math.pi if first + math.pi <= limits.high else first - math.pi]
+    if not all(limits.low - _ROUNDING <= each <= limits.high + _ROUNDING for each in pair):
+        raise ConfigError(
+            f"The views would be at {' and '.join(map(degrees, pair))}; the stage goes from {degrees(limits.low)} to "
+            f"{degrees(limits.high)}. Give --angle another value. Nothing was started."
+        )
+    frames, _ = take(_blocks(plan.exposure, pair), config, instrument, stop, sink)
+    return evaluate(frames, config.optics.pixel_size_um * 1e-3 * config.devices.camera.binning)
+
+
+def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
+    """Evaluate darks, flats, and two frames of each of two views.
+
+    Args:
+        pixel_size: mm, of a (binned) pixel at the sample.
+
+    Raises:
+        QualityError: the views show no axis.
+    """
+    darks, flats, views = (
+        [frame for frame in frames if frame.kind is kind]
+        for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION)
+    )
+    dark = mean_counts(darks)
+    light = np.maximum(mean_counts(flats) - dark, 1.0)
+    integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / light) for frame in views]
+    one, other = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
+    try:
+        pair = align_pair(one, other)
+    except AxisError as error:
+        raise QualityError(f"The two views show no axis: {error}") from error
+    if not pair.confident:
+        raise QualityError(
+            f"The two views do not match: the axis may be near column {pair.axis_col:.1f}, or not. Take a sample with "
+            "more contrast that stays in the field of view, and look at the flats."
+        )
+    offset = pair.axis_col - (dark.shape[1] - 1) / 2
+    return Alignment(
+        axis_col=pair.axis_col,
+        offset=offset,
+        offset_mm=offset * pixel_size,
+        tilt=pair.tilt,
+        uncertainty=pair.uncertainty,
+        detail=finest_structure(integrals[0], integrals[1]),
+        angle=views[0].angle,
+        rows=dark.shape[0],
+    )
+
+
+def _blocks(exposure: float, pair: Sequence[float]) -> list[Block]:
+    static = [static_block(kind, N, exposure) for kind in (FrameKind.DARK, FrameKind.FLAT)]
+    return [*static, Block(FrameKind.PROJECTION, Mode.STEP, 0, np.repeat(pair, TWICE), exposure, exposure)]

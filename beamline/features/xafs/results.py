@@ -1,0 +1,181 @@
+"""Results: an energy scan's result as sentences, as a table and as a picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from beamline.core.files import refuse_existing, write_whole
+from beamline.features.xafs.contrast import XafsCurve
+from beamline.features.xafs.edge import AbsorptionEdge
+from beamline.report.figures import png
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+@dataclass(frozen=True, eq=False)
+class XafsResult:
+    """The curve of an energy scan and its edge.
+
+    Attributes:
+        title: what was scanned.
+        material, elements: its name and atomic numbers, of a scene; empty: not known, as of a measured file.
+    """
+
+    title: str
+    curve: XafsCurve
+    edge: AbsorptionEdge
+    material: str = ""
+    elements: tuple[int, ...] = ()
+
+    @property
+    def tabulated(self) -> str:
+        """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
+        from beamline.features.xafs.tabulated import edge_sentence  # lazily: it imports xraylib, which takes a while
+
+        low, high = (float(end) for end in self.curve.energies[[0, -1]])
+        return edge_sentence(self.material, self.elements, low, high, self.edge.energy)
+
+    @property
+    def criterion(self) -> str:
+        """The quantity that is largest at the best energy."""
+        return "absorption" if self.curve.contrast_to_noise is None else "contrast-to-noise"
+
+    def data(self) -> dict[str, Any]:
+        """Values for programs; energies in keV."""
+        curve, edge = self.curve, self.edge
+        first, last = curve.nearly_best
+        cnr = curve.contrast_to_noise
+        return {
+            "what": self.title,
+            "n_energies": curve.energies.size,
+            "n_left_out": curve.left_out.size,
+            "from_kev": curve.energies[0],
+            "to_kev": curve.energies[-1],
+            "edge_seen": edge.found,
+            "why_not": edge.reason or None,
+            "edge_kev": edge.energy,
+            "tabulated": self.tabulated or None,
+            "white_line_kev": edge.white_line,
+            "best_kev": curve.energies[curve.best],
+            "best_by": self.criterion,
+            "best_from_kev": first,
+            "best_to_kev": last,
+            "contrast_to_noise": None if cnr is None else cnr[curve.best],
+            "absorption": curve.absorption[curve.best],
+            "unit": curve.unit,
+            "noise": edge.noise,
+        }
+
+
+def lines(result: XafsResult) -> list[str]:
+    """Sentences for people."""
+    curve, edge = result.curve, result.edge
+    text = [f"{result.title}: {curve.energies.size} energies, {curve.energies[0]:.4f} to {curve.energies[-1]:.4f} keV"]
+    if curve.left_out.size:
+        text.append(f"left out    {left_out(curve)}")
+    if edge.energy is None:
+        text.append(f"no edge     {edge.reason}")
+    else:
+        text.append(f"edge        {edge.energy:.4f} keV, where the absorption rises most steeply")
+        text.append(
+            "white line  none above the edge within the range"
+            if edge.white_line is None
+            else f"white line  {edge.white_line:.4f} keV, the top of the absorption"
+        )
+    text += [f"{'in tables':<12}{result.tabulated}"] if result.tabulated else []
+    first, last = curve.nearly_best
+    cnr = curve.contrast_to_noise
+    height = "" if cnr is None else f" of {cnr[curve.best]:.3g} a pixel at this thickness"
+    text.append(
+        f"best        {curve.energies[curve.best]:.4f} keV: highest {result.criterion}{height} "
+        f"(95 % of it from {first:.4f} to {last:.4f} keV)"
+    )
+    return text
+
+
+def left_out(curve: XafsCurve) -> str:
+    """The energies that are left out, as a sentence."""
+    e = curve.left_out
+    where = f"{e[0]:.4f} keV" if e.size == 1 else f"{e.size} energies between {e[0]:.4f} and {e[-1]:.4f} keV"
+    return f"{where}: too dark, too bright for the sensor, or without values"
+
+
+def table(curve: XafsCurve) -> str:
+    """CSV: energy, absorption and, where they are known, contrast, noise and contrast-to-noise."""
+    columns: dict[str, Any] = {"energy_kev": curve.energies, f"absorption ({curve.unit})": curve.absorption}
+    if curve.contrast is not None and curve.noise is not None:
+        columns |= {"contrast": curve.contrast, "noise": curve.noise}
+    if (cnr := curve.contrast_to_noise) is not None:
+        columns["contrast_to_noise"] = cnr
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True))
+    return out.getvalue()
+
+
+def picture(result: XafsResult) -> bytes:
+    """PNG: the absorption over energy with edge, white line and best energy, and the contrast-to-noise below."""
+    from matplotlib.figure import Figure
+
+    curve, edge, cnr = result.curve, result.edge, result.curve.contrast_to_noise
+    figure = Figure(figsize=(8.6, 3.4 if cnr is None else 5.4), dpi=110, layout="constrained")
+    panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))
+    top = panels[0]
+    top.plot(curve.energies, curve.absorption, color="0.25", lw=1.2, marker=".", ms=3)
+    top.set(ylabel=f"absorption ({curve.unit})", title=result.title)
+    if cnr is not None:
+        panels[1].plot(curve.energies, cnr, color="tab:green", lw=1.2, marker=".", ms=3)
+        panels[1].set(ylabel="contrast-to-noise a pixel")
+    panels[-1].set(xlabel="energy (keV)")
+    for energy in curve.left_out:
+        top.axvline(energy, color="0.85", lw=1.0, zorder=0)
+    marks = (
+        (edge.energy, "edge", "tab:blue"),
+        (edge.white_line, "white line", "tab:orange"),
+        (float(curve.energies[curve.best]), "best", "tab:green"),
+    )
+    for axes in panels:
+        for energy, name, colour in marks:
+            if energy is not None:
+                axes.axvline(energy, color=colour, lw=1.1, ls="--", label=f"{name} {energy:.4f} keV")
+        axes.grid(alpha=0.3)
+    top.legend(fontsize=8, title=None if edge.found else "no edge found")
+    return png(figure)
+
+
+def table_beside(target: Path) -> Path:
+    """Path of the table that belongs to a picture."""
+    return target.with_suffix(".csv")
+
+
+def refuse_existing_results(target: Path) -> None:
+    """Raises DataError if the picture or the table exists already, or if their folder does not exist."""
+    for path in (target, table_beside(target)):
+        refuse_existing(path)
+
+
+def write(result: XafsResult, target: Path) -> None:
+    """The picture and the table beside it; errors as those of `write_both`."""
+    write_both(picture(result), table(result.curve), target)
+
+
+def write_both(drawn: bytes, text: str, target: Path) -> None:
+    """A picture, PNG, and the table beside it.
+
+    Raises:
+        DataError: one of them exists, or the disk refuses; then neither is there.
+    """
+    with ExitStack() as undo:
+        for path, content in ((target, drawn), (table_beside(target), text.encode())):
+            write_whole(path, content)
+            undo.callback(path.unlink)
+        undo.pop_all()

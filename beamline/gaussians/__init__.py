@@ -1,0 +1,1 @@
+"""The Gaussians behind a volume."""

@@ -1,0 +1,188 @@
+"""Floater: a crumb that crosses the field in some views, on a way that nothing in the turning sample takes.
+
+Its track is found by the sum over all views that show it (`track`), and held against the sample: a point of it moves on
+a sinusoid about the axis, no farther from it than the sample reaches. A crumb absorbs the same in every view; edges and
+textures of the sample, which may lie on a line by chance, do not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from beamline.core.flag import PixelBox
+from beamline.monitor.change import MOST_STEPS
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.foreign.track import Octave, SampleMotion, Track, tracks_of, with_view
+from beamline.monitor.view import CellGrid
+from drivers.base.frame import Frame
+
+OCTAVES = 4  # steps of 1, 2, 4 and 8 views
+FASTEST_RIM = 4.0  # cells a step that the rim moves: with more the sample changes wholly from step to step
+EVEN = 0.5  # of a step: the next view comes as many steps, or up to MOST_STEPS, after the last
+COARSEST = math.radians(20)  # a view: more is no motion that could be followed
+WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
+MARGIN = 1.1  # the sample may be a little wider than the field
+CONE = 1.4  # likewise; nearer to the source it moves faster, by 1.3 at half a cone angle of 15 degrees
+OFF_MIDDLE = 0.05  # of the field: where the axis may be if it is not stated
+UNLIKELY = 36.0  # least difference of the squares of score and rival: 6 standard deviations, beyond what a search finds
+RIVAL = 0.85  # of the score, at most: both grow with the depth, and so does what either misses
+UNEVEN = 2.5  # mean square deviation from one depth, at most; of noise 1, in a few steps up to 2
+NEAR = 3.0  # cells between two tracks of the same crumb
+BOX = 3.0  # cells from the middle of a floater to the edges of its region
+HALF = 0.5  # of the depth, above which a row belongs to the crumb
+HIGHEST = 8  # cells above and below the track in which its rows are sought
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCrumb:
+    """A crumb that was found.
+
+    Attributes:
+        first, last: rows in the file of the views that show it, so far.
+        time, col, speed: where it was last, in views and cells, and its speed in cells a view.
+        top, below: cells, first row and row after the last.
+    """
+
+    first: int
+    last: int
+    time: float
+    col: float
+    speed: float
+    top: int
+    below: int
+
+
+@dataclass(frozen=True, eq=False)
+class FloaterState:
+    """The views since a gap: the last one's time in views, the angles of the first and the last, their step in rad."""
+
+    octaves: tuple[Octave, ...] = ()
+    time: float = 0.0
+    start: float = math.nan
+    angle: float = math.nan
+    step: float = math.nan
+    crumbs: tuple[SeenCrumb, ...] = ()
+
+
+@dataclass(frozen=True)
+class FloaterCheck:
+    """Score: the sum along the track in standard deviations."""
+
+    name: ClassVar[str] = "floater"
+    bit: ClassVar[int] = 10
+    unit: ClassVar[str] = "standard deviations"
+    meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
+    policy: ClassVar[Policy] = Policy.LOG
+
+    warn: Annotated[float, Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
+
+    start = FloaterState
+
+    def look(self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FloaterState]:
+        view, grid = context.view, context.grid
+        if view is None or grid is None:
+            return Look(state)
+        state = _after(state, view.angle, context.follows)
+        if not state.step < COARSEST:
+            return Look(state)
+        half = grid.shape[1] / 2
+        octaves, tracks = [], list[Track]()
+        for before in state.octaves:
+            octave = before
+            if octave.views == 1 or half * state.step * octave.views <= FASTEST_RIM:
+                octave = with_view(before, view.index, state.time, view.depth, view.weight)
+                if octave.n > before.n:
+                    tracks += tracks_of(octave, _sample(grid, context, state.step), self.warn)
+            octaves.append(octave)
+        state = replace(state, octaves=tuple(octaves))
+        sure = [track for track in tracks if _is_crumb(track)]
+        return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else Look(state)
+
+    def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> Look[FloaterState]:
+        """The flag for the views that show the crumb, since the last flag for it."""
+        newest, oldest = track.steps[0], track.steps[-1]
+        top, below = _rows(track)
+        crumb = SeenCrumb(oldest.rows[0], newest.rows[1], newest.time, float(track.cols[0]), track.speed, top, below)
+        known = [each for each in state.crumbs if _same(each, crumb)]
+        others = tuple(each for each in state.crumbs if each not in known and crumb.last - each.last <= grid.shape[1])
+        after = replace(state, crumbs=(*others, crumb))
+        if known:
+            first = min(each.first for each in known)
+            after = replace(after, crumbs=(*others, replace(crumb, first=min(first, crumb.first))))
+        begin = max([crumb.first, *(each.last + 1 for each in known if crumb.first >= each.first)])
+        if begin > crumb.last:
+            return Look(after)
+        span = max(newest.time - oldest.time, 1.0)
+        share = (crumb.last - begin) / max(crumb.last - crumb.first, 1)
+        where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
+        cell = grid.cell
+        advice = (
+            f"A crumb crosses the field: rows {top * cell} ... {below * cell - 1}, frames {after.crumbs[-1].first} ... "
+            f"{crumb.last} so far, {abs(track.speed) * cell:.1f} px a view to the "
+            f"{'right' if track.speed > 0 else 'left'}. No point of the turning sample moves so: it falls, floats, or "
+            "sits on the holder. Find it and blow it off; scan again if its streaks disturb, recon gives its rays "
+            "less weight."
+        )
+        flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
+        return Look(after, flag)
+
+
+def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:
+    """The state at the next view; tracks begin anew where it is no neighbour of the last one, or at uneven steps."""
+    steps = 1.0
+    if state.time > 0 and state.step != 0:
+        steps = (angle - state.angle) / math.copysign(state.step, state.angle - state.start)
+    elif state.time > 0:
+        steps = 1.0 if angle == state.angle else math.nan
+    if not state.octaves or not follows or not EVEN < steps < MOST_STEPS + EVEN:
+        return FloaterState(tuple(Octave(2**i) for i in range(OCTAVES)), 0.0, angle, angle)
+    time = state.time + max(round(steps), 1)
+    return replace(state, time=time, angle=angle, step=abs(angle - state.start) / time)
+
+
+def _sample(grid: CellGrid, context: ScanContext, step: float) -> SampleMotion:
+    cols = grid.shape[1]
+    if context.axis_col is None:
+        middle = (cols - 1) / 2
+        axes: tuple[float, ...] = (middle - OFF_MIDDLE * cols, middle, middle + OFF_MIDDLE * cols)
+    else:
+        axes = ((context.axis_col + 0.5) / grid.cell - 0.5,)
+    wide = WIDER if context.truncated else CONE if context.cone else MARGIN
+    return SampleMotion(step, axes, cols / 2 * wide)
+
+
+def _is_crumb(track: Track) -> bool:
+    unlike = track.score**2 - track.rival**2 >= UNLIKELY and track.rival <= RIVAL * track.score
+    return unlike and track.uneven <= UNEVEN
+
+
+def _same(known: SeenCrumb, crumb: SeenCrumb) -> bool:
+    """Whether it goes on where the known one was going."""
+    apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
+    rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
+    return rows and apart <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))
+
+
+def _rows(track: Track) -> tuple[int, int]:
+    """First row of cells of the crumb, and the row after the last."""
+    rows, cols = track.steps[0].change.shape
+    at = np.clip(np.floor(track.cols + 0.5).astype(int), 0, cols - 1)
+    depth = np.mean([step.change[:, col] for step, col in zip(track.steps, at, strict=True)], axis=0)
+    deep = depth > HALF * depth[track.row]
+    top = below = track.row
+    while top > max(0, track.row - HIGHEST) and deep[top - 1]:
+        top -= 1
+    while below < min(rows, track.row + HIGHEST) and deep[below]:
+        below += 1
+    return top, max(below, top + 1)
+
+
+def _region(grid: CellGrid, crumb: SeenCrumb, col: float) -> PixelBox:
+    height = crumb.below - crumb.top + 2
+    return grid.region((crumb.top + crumb.below - 1) / 2, col, height, 2 * BOX)

@@ -1,0 +1,207 @@
+"""Ghost: a broad hump of too much or too little light that crosses the field from side to side.
+
+As for a floater the filters suppress everything that turns with the stage (`fan`). But they use the
+mean of all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are below the
+noise. In the mean of thousands of pixels they are a hundred times its noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
+from beamline.monitor.digest import FrameDigest
+from beamline.monitor.foreign.fan import Clutter, Filters, correlate, filters, window
+from beamline.monitor.view import CellValues
+from drivers.base.frame import Frame
+from recon.base.arrays import median_deviation
+
+COLUMNS = 32  # broad columns of the field
+PARTS = 8  # of the rows
+MOST_PARTS = 25.0  # percentile of the parts that must have the change
+ALIKE = 0.25  # share of the mean: a ghost is as high as the frame, a floater is only in some parts
+LAGS = (-4, -3, -2, -1, 0)  # times the stride
+SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
+MOST_STRIDE = 3
+WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
+CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first light in the field to its last
+STRUCTURE, COMMON = 0.3, 0.05**2
+MARGIN = 1.2
+WIDER = 2.2  # as for a floater
+FASTER = 1.3
+SHOWS = 4.0  # standard deviations that a hump at the limit must reach, or its filter is left out
+CALIBRATION = 24  # views
+LEAST_NOISE = 3e-4
+MEMORY, OUTLIER = 0.03, 3.0
+PEAK = 5.0
+SPAN, LEAST, SHARE = 10, 4, 0.6  # views that a trail takes at most, has a peak in at least, and what share has one
+OFF, SLACK = 2.5, 0.15  # broad columns: from a peak to its trail; a view, added to the sample's speed
+
+
+class Peak(NamedTuple):
+    """The highest output in a view: its broad column, and its score with its sign."""
+
+    view: int
+    col: float
+    score: float
+
+
+class Trail(NamedTuple):
+    """Peaks on a straight line in time, faster than the sample could carry them: first view, broad columns a view."""
+
+    first: int
+    speed: float
+
+
+@dataclass(frozen=True, eq=False)
+class GhostState:
+    profiles: tuple[CellValues, ...] = ()  # float32 [part of the rows, broad column] of the last views, oldest first
+    angle: float = math.nan
+    filters: Filters | None = None  # for the angle's `step` in radians
+    step: float = math.nan
+    usual: CellValues | None = None  # usual output of the filters at each column, None before the first
+    peaks: tuple[Peak, ...] = ()  # of the last views, oldest first
+
+
+@dataclass(frozen=True)
+class GhostCheck:
+    """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
+    ghost that leaves a place looks like a shadow that comes.
+    """
+
+    name: ClassVar[str] = "ghost"
+    bit: ClassVar[int] = 11
+    unit: ClassVar[str] = "relative change of the light"
+    meaning: ClassVar[str] = (
+        "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
+    )
+    policy: ClassVar[Policy] = Policy.LOG
+
+    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the ghost")] = 0.01
+    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
+
+    start = GhostState
+
+    def look(self, state: GhostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[GhostState]:
+        view, grid = context.view, context.grid
+        if view is None or grid is None or view.depth.shape[1] < COLUMNS:
+            return Look(state)
+        if context.change is None:
+            return Look(GhostState((_profiles(view.depth, view.weight),), view.angle))
+        step = abs(view.angle - state.angle)
+        profiles = (*state.profiles, _profiles(view.depth, view.weight))
+        state = replace(state, profiles=profiles[-max(CALIBRATION, -LAGS[0] * MOST_STRIDE + 1) :], angle=view.angle)
+        if len(profiles) < CALIBRATION:
+            return Look(state)
+        stride = max(1, min(MOST_STRIDE, round(SWEEP / max(step, 1e-9))))
+        radius = COLUMNS / 2 * (WIDER if context.truncated else 1.0)
+        if state.filters is None or not abs(radius * step / state.step - 1) < 0.2:
+            made = _designed(radius * step, stride, _noise(state.profiles, stride), self.warn)
+            state = replace(state, filters=made, step=radius * step, usual=None)
+        assert state.filters is not None
+        if not state.filters.speeds.size:
+            return Look(state)
+        chosen = np.stack([state.profiles[-1 + lag * stride] for lag in LAGS])
+        outputs = np.empty((state.filters.speeds.size, *chosen.shape[1:]), np.float32)
+        correlate(chosen, state.filters.weights, outputs)
+        return self._judge(state, frame.index, outputs, radius * step / (COLUMNS / 2), context)
+
+    def _judge(
+        self, state: GhostState, now: int, outputs: CellValues, turn: float, context: ScanContext
+    ) -> Look[GhostState]:
+        """The highest output, relative to the usual one there, and the peaks of earlier views."""
+        assert state.filters is not None and context.grid is not None
+        parts, outputs = outputs, outputs.mean(axis=1)
+        spread = np.sqrt(np.mean(outputs**2, axis=0))
+        usual = np.maximum(spread, 1.0) if state.usual is None else state.usual
+        scores = outputs / np.maximum(usual, 1.0)
+        signal, col = np.unravel_index(np.abs(scores).argmax(), scores.shape)
+        score, depth = float(scores[signal, col]), float(outputs[signal, col] / state.filters.strength[signal])
+        old = tuple(peak for peak in state.peaks if peak.view >= now - SPAN)
+        usual = usual + np.float32(MEMORY) * (np.minimum(spread, OUTLIER * usual) - usual)
+        state = replace(state, usual=usual, peaks=old)
+        if abs(score) <= PEAK or abs(depth) <= self.warn:
+            return Look(state)
+        if np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) <= ALIKE:
+            return Look(state)
+        peaks = (*old, Peak(now, float(col), score))
+        state = replace(state, peaks=peaks)
+        trail = best_trail(peaks, FASTER * turn)
+        if trail is None:
+            return Look(state)
+        light = abs(math.expm1(-depth))
+        level, limit = (Level.ALARM, self.alarm) if light > self.alarm else (Level.WARN, self.warn)
+        rows, cols = context.grid.shape
+        broad = cols / COLUMNS
+        region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
+        advice = (
+            f"A ghost crosses the field, a broad hump: it changes the light by {light:.1%}, "
+            f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
+            "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
+            + again_by(self.name)
+        )
+        return Look(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
+
+
+def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
+    """Mean line integral of the cells that are lit [part of the rows, broad column]."""
+    starts = np.arange(min(PARTS, depth.shape[0])) * depth.shape[0] // min(PARTS, depth.shape[0])
+    columns = np.arange(COLUMNS) * depth.shape[1] // COLUMNS
+    sums, lit = (
+        np.add.reduceat(np.add.reduceat(x, starts, axis=0), columns, axis=1)
+        for x in (depth, (weight > 0).astype(np.float32))
+    )
+    return np.asarray(sums / np.maximum(lit, 1), np.float32)
+
+
+def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
+    """Noise of a profile, including unsteady changes of the sample: from second differences over `stride` views."""
+    seen = np.stack([profile.mean(axis=0) for profile in profiles])
+    second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
+    return max(median_deviation(second) / math.sqrt(6.0), LEAST_NOISE)
+
+
+def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
+    """The filters for a sample whose rim moves `rim` broad columns a view."""
+    views, cols = window(LAGS)
+    signals, speeds = [], []
+    for width in WIDTHS:
+        for crossing in CROSSINGS:
+            for sign in (-1.0, 1.0):
+                speed = sign * COLUMNS * (1 + 2 * width) / crossing
+                if abs(speed) > FASTER * rim:
+                    away = np.clip((cols - speed * stride * views) / (width * COLUMNS), -1, 1)
+                    signals.append(np.cos(0.5 * np.pi * away) ** 2)
+                    speeds.append(speed)
+    clutter = Clutter(MARGIN * rim * stride, STRUCTURE, COMMON, noise**2)
+    made = filters(LAGS, clutter, np.array(signals).reshape(len(speeds), views.size), np.array(speeds))
+    keep = made.strength * 2 * limit > SHOWS
+    return Filters(made.weights[keep], made.strength[keep], made.speeds[keep])
+
+
+def best_trail(peaks: Sequence[Peak], turn: float) -> Trail | None:
+    """The trail with the largest sum of scores that ends at the last of the peaks, one a view, if there is one.
+
+    A point of the sample at x from the middle moves by less than turn sqrt(radius² - x²) a view, `turn` in radians a
+    view; x and radius, half the field, are in broad columns.
+    """
+    best, most, last = None, 0.0, peaks[-1]
+    alike = [peak for peak in peaks if peak.score * last.score > 0]
+    for first in alike:
+        age = last.view - first.view
+        if age < LEAST - 1:
+            break
+        speed, beside = (last.col - first.col) / age, (last.col + first.col - COLUMNS + 1) / 2
+        if abs(speed) < turn * math.sqrt(max((COLUMNS / 2) ** 2 - beside**2, 0.0)) + SLACK:
+            continue
+        since = [peak for peak in alike if peak.view >= first.view]
+        near = [abs(p.score) for p in since if abs(p.col - (last.col - speed * (last.view - p.view))) <= OFF]
+        if len(near) >= max(LEAST, SHARE * (age + 1)) and (total := sum(near)) > most:
+            best, most = Trail(first.view, speed), total
+    return best

@@ -1,0 +1,288 @@
+"""Calibration: what the scan does not state of its geometry and its detector is learnt from the views themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.projections.selection import geometry_of, pivot_of, rows_of, with_pivot
+from beamline.projections.step import StepDone, StepMemory, option
+from recon.base.registry import unknown
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from beamline.projections.prepared import PreparedProjections
+    from beamline.projections.protocols import ScanPart
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+    from recon.base.arrays import I64
+    from recon.base.geometry import Geometry
+    from recon.features.calibration.freedom import GeometryChange
+    from recon.features.calibration.learn import LearntGeometry
+
+    Progress = Callable[[int, int], None]
+    GeometryOf = Callable[[Selection, I64], Geometry]
+
+GEOMETRY = "axis", "roll", "tilt", "shifts"
+OF_VIEWS = "background", "gains"  # terms that change line integrals
+_COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
+
+
+def _terms(text: str) -> tuple[str, ...]:
+    """A list of terms without "none"; in the order in which they are learnt."""
+    names = [name.strip() for name in text.split(",")]
+    if names == ["none"]:
+        return ()
+    every = *GEOMETRY, *OF_VIEWS
+    if others := [name for name in names if name not in every]:
+        raise ValueError(unknown("term", others[0], every))
+    return tuple(name for name in every if name in names)
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """What is learnt from the views.
+
+    Attributes:
+        terms: names; none: nothing.
+    """
+
+    name: ClassVar[str] = "calibrate"
+    asked_by: ClassVar[str] = "--calibrate"
+    follows: ClassVar[tuple[str, ...]] = ("jumps", "poses", "background")
+    terms: tuple[str, ...] = option(
+        "--calibrate",
+        "none",
+        "Learn these from the views, separated by commas: axis, roll (lean of the axis in the detector's plane), tilt "
+        "(lean along the beam), shifts (of each view), background (of the beam), gains (of pixels). Views are not "
+        "resampled. What held-out views do not confirm is not changed.",
+        parse=_terms,
+        metavar="LIST",
+    )
+
+    @property
+    def geometry(self) -> frozenset[str]:
+        """The terms that change the geometry."""
+        return frozenset(self.terms).intersection(GEOMETRY)
+
+    @property
+    def may_lean(self) -> bool:
+        """Whether views may come out rolled or tilted: a row then shows several slices."""
+        return not self.geometry.isdisjoint({"roll", "tilt"})
+
+    @property
+    def needs_finished(self) -> str:
+        return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from recon.features.calibration.background import background_memory
+        from recon.features.calibration.gains import gains_memory
+
+        need_of = {"background": background_memory, "gains": gains_memory}
+        terms = [need_of[term](part.geometry) for term in self.terms if term in need_of]
+        return StepMemory(alone=max([_search_memory(part, self.geometry), *terms]))
+
+    def refuse_few(self, used: int, usable: int, cols: int) -> None:
+        """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+        from recon.features.calibration import background, gains
+        from recon.features.calibration.learn import LEAST_VIEWS
+
+        limits = {"background": (background.LEAST_VIEWS, 1), "gains": (gains.LEAST_VIEWS, gains.LEAST_COLS)}
+        for term in self.terms:
+            (least, wide), views = limits.get(term, (LEAST_VIEWS, 1)), used if term in limits else usable
+            if views < least or cols < wide:
+                raise DataError(
+                    f"--calibrate {term}: {views} views of {cols} columns are too few; {least} of {wide} are needed. "
+                    "Leave it out. No view was read."
+                )
+
+    def learn(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        frames: NDArray[np.int64],
+        geometry_before: GeometryOf,
+        progress: Callable[[int, int], None],
+    ) -> Calibrated:
+        """The geometry of these frames as `calibrated` learns it, by the step's own terms."""
+        return calibrated(source, selection, frames, geometry_before, self.geometry, progress)
+
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
+        if not self.terms:
+            return StepDone(parameters={})
+        done = [views.done[self.name]] if self.name in views.done else []
+        learn = {"background": without_learnt_background, "gains": without_learnt_gains}
+        done += [learn[term](views, progress) for term in OF_VIEWS if term in self.terms]
+        sentence = " ".join(each.sentence for each in done if each.sentence)
+        values = {key: value for each in done for key, value in (each.parameters or {}).items()}
+        return StepDone(sentence, {"calibrate": ",".join(self.terms), "calibrate_said": sentence, **values})
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """What was learnt of the geometry of some views.
+
+    Attributes:
+        frames: rows of the file, in order.
+        change: in pixels of the detector, about the middle row of the band.
+        pitch: mm of such a pixel.
+        off_middle: rows from the middle of the band to that of the detector, about which views roll and tilt.
+        pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
+        binning: of the pixels of the band.
+        learnt: with what views held out say of it.
+    """
+
+    frames: I64
+    change: GeometryChange
+    pitch: float
+    off_middle: float
+    pivot: float
+    binning: int
+    learnt: LearntGeometry
+
+    @property
+    def done(self) -> StepDone:
+        return StepDone(self.learnt.in_words(self.binning), self.learnt.parameters(self.binning))
+
+    @property
+    def axis(self) -> float:
+        """Displacement of the axis in the detector's middle row, in columns."""
+        return self.change.axis + self.off_middle * math.tan(self.change.roll)
+
+    def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
+        """The geometry of these rows of the file, which may be binned, as it was learnt."""
+        at = np.searchsorted(self.frames, view_ids)
+        change = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
+        return with_pivot(change.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
+
+
+def calibrated(
+    source: ScanSource,
+    selection: Selection,
+    frames: I64,
+    geometry_before: GeometryOf,
+    terms: frozenset[str],
+    progress: Callable[[int, int], None],
+) -> Calibrated:
+    """The geometry of these frames, learnt from a band in the middle of the rows used.
+
+    Args:
+        frames: rows of the file, in order.
+        geometry_before: the geometry of frames in the rows and with the binning of a selection, before calibration.
+        progress: how many steps are done, of how many at most.
+
+    Raises:
+        DataError: too few views, or nothing in the beam.
+    """
+    from beamline.projections.correction import ScanCorrection
+    from recon.base.masks import areas
+    from recon.features.calibration.learn import learn_geometry
+
+    band = _band(source, selection)
+    views = ScanCorrection(source, band, lambda _: None).at_once(frames)
+    ids = views.view_ids
+    before = geometry_before(band, ids)
+    lit = ~areas(views.masked)
+    try:
+        learnt = learn_geometry(
+            views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
+        )  # fmt: skip
+    except ValueError as error:
+        raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
+    looked, middle = rows_of(source, band), (source.shape[0] - 1) / 2
+    whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
+    off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
+    change = learnt.change.scaled(band.binning)
+    return Calibrated(ids, change, whole.pixel_pitch, off, pivot_of(source, selection), band.binning, learnt)
+
+
+def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
+    """Bytes that `calibrated` takes at most."""
+    if not terms:
+        return 0
+    from beamline.projections.correction import at_once_memory
+
+    band = _band(part.source, part.selection)
+    rows, frames = rows_of(part.source, band), part.geometry.n_views
+    pixels = (rows.stop - rows.start) * part.source.shape[1] // band.binning**2
+    return at_once_memory(part.source, band, frames) + 4 * _COPIES * frames * pixels
+
+
+def _band(source: ScanSource, selection: Selection) -> Selection:
+    """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
+
+    Of the rows around a region it takes those of the whole volume, for which the region is cut out of it.
+    """
+    from recon.features.calibration.learn import COLS, ROWS
+
+    used = rows_of(source, replace(selection, rows=selection.axis_rows or selection.rows))
+    height = used.stop - used.start
+    binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
+    n = min(height, ROWS * binning)
+    first = (used.start + used.stop - n) // 2
+    return replace(selection, rows=(first, first + n), binning=binning)
+
+
+def without_learnt_background(views: PreparedProjections, progress: Progress) -> StepDone:
+    """Take the background of the beam off the views where views held out confirm it, see `learn_background`."""
+    from recon.features.calibration.background import learn_background
+
+    data, ids = views.projections.data, views.projections.view_ids
+    first, last = int(ids.min()), int(ids.max())
+
+    def times(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.clip((numbers - first) / max(last - first, 1), 0.0, 1.0)
+
+    try:
+        learnt = learn_background(data, views.geometry, times(ids), views.measured, progress)
+    except ValueError as error:
+        raise DataError(f"--calibrate background: {error}. Leave it out.") from error
+    judged = f"views held out are left {learnt.without:.3g} without it and {learnt.left:.3g} with it"
+    values = {"learnt_background_held_out_before": learnt.without, "learnt_background_held_out_after": learnt.left}
+    if not (learnt.drift or learnt.mean):
+        sentence = "Background learnt with the volume: views held out confirm none; nothing taken off."
+        return StepDone(sentence, {"learnt_background": sentence, **values})
+    learnt.remove(data, times(ids))
+    if views.held_out is not None and views.held_out_ids is not None:
+        learnt.remove(views.held_out[0], times(views.held_out_ids))
+    what = " and ".join(name for name, there in (("its drift", learnt.drift), ("its mean", learnt.mean)) if there)
+    sentence = (
+        f"Background learnt with the volume: {what}, {learnt.size:.3f} of line integral (root mean square), on average "
+        f"from {learnt.lowest:+.3f} to {learnt.highest:+.3f}; taken off: {judged}. What all views show alike cannot be "
+        "told from density where the volume has no air."
+    )
+    return StepDone(sentence, {"learnt_background": sentence, "learnt_background_terms": learnt.coefficients, **values})
+
+
+def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
+    """Take gains of pixels off the views where views held out confirm them, see `learn_gains`."""
+    from recon.features.calibration.gains import NEAR_AXIS, learn_gains
+
+    try:
+        learnt = learn_gains(views.projections.data, views.geometry, views.measured, progress)
+    except ValueError as error:
+        raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
+    values = {"learnt_gains_held_out_before": learnt.without, "learnt_gains_held_out_after": learnt.left}
+    judged = f"views held out are left {learnt.without:.4g} without them and {learnt.left:.4g} with them"
+    if learnt.without == 0:
+        judged = "no stripes are seen in the views that are the detector's"
+    if not learnt.confirmed:
+        sentence = f"Gains learnt with the volume: none taken off; {judged}."
+        return StepDone(sentence, {"learnt_gains": sentence, **values})
+    for view in views.projections.data:
+        view -= learnt.pixels
+    if views.held_out is not None:
+        views.held_out[0][...] -= learnt.pixels
+    sentence = (
+        f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
+        f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."
+    )
+    return StepDone(sentence, {"learnt_gains": sentence, "learnt_gains_of_pixels": learnt.pixels, **values})

@@ -1,0 +1,263 @@
+"""The memory of a reconstruction, at once and in slabs, and what is refused because of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.machine import free_memory
+from beamline.core.text import count, size
+from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.protocols import ScanPart
+from beamline.projections.registry import geometry_steps, in_order
+from beamline.projections.selection import choose_views, rows_of
+from beamline.projections.step import StepMemory
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.several_scans import views_of_others
+from beamline.reconstruct.workers import cluster
+from beamline.storage.readers.base import ScanSource
+from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
+from recon.base.slabs import Slab
+from recon.base.volume import Grid
+from recon.base.work import CostedMethod
+from recon.error_bars import HALO, error_bars_memory
+from recon.voxels.direct import Fbp
+from recon.voxels.odd_views import odd_views_memory
+from recon.voxels.stray_mass import stray_mass_memory
+from recon.voxels.unexplained import unexplained_memory
+
+SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
+
+_COPIES = 4  # float32 copies of a view while it is corrected
+_ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
+_REGIONS, _REGION = 2**21, 12  # voxels at most of the regions that judge volumes (`metrics.sampled`); bytes of a voxel
+_NO_STEPS = StepMemory()
+_EMISSION = 6 * 4  # bytes a pixel: counts, survival, background and weights, and what they are made of
+_ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
+
+
+@dataclass(frozen=True)
+class ReconMemory:
+    """Bytes that a reconstruction needs.
+
+    Attributes:
+        geometry: of the views, binned; before any is read, one that is alike.
+        raw: of the pixels as they are read.
+        steps: bytes that the steps of the correction take.
+        largest_step: name of the one that takes the most alone.
+        bars: error bars are made, too.
+    """
+
+    method: Method
+    geometry: Geometry
+    raw: int
+    weighted: bool
+    steps: StepMemory = _NO_STEPS
+    largest_step: str = ""
+    bars: bool = False
+
+    @classmethod
+    def of(
+        cls, method: Method, views: int, shape: tuple[int, int], itemsize: int, axis_col: float | None = None
+    ) -> ReconMemory:
+        """Before any frame is read: of so many views [row, col], bytes of a pixel, and the axis where it is known."""
+        alike = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), shape, axis_col=axis_col)
+        return cls(method, alike, views * math.prod(shape) * itemsize, not method.traits.direct)
+
+    @property
+    def rows(self) -> int:
+        return self.geometry.detector_shape[0]
+
+    @property
+    def line_integrals(self) -> int:
+        return 4 * self.geometry.n_views * math.prod(self.geometry.detector_shape)
+
+    @property
+    def volume(self) -> int:
+        """Of the result, which may be several volumes."""
+        return 4 * volumes_of(self.method) * math.prod(Grid.matching(self.geometry).shape)
+
+    @property
+    def at_once(self) -> int:
+        """With everything in memory."""
+        work = self._work(self.method, self.geometry, self._grid(self.rows))
+        return self.raw + self.line_integrals + max(work, self.steps.correcting, self._alone)
+
+    @property
+    def _alone(self) -> int:
+        """A step that is alone in memory, beyond the program's own."""
+        return self.steps.alone if self.steps.alone > _ASIDE else 0
+
+    @property
+    def view(self) -> int:
+        """While one view is corrected."""
+        return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
+
+    def slab(self, height: int) -> int:
+        """A slab of so many slices of its own, with its views and weights; figures of the volume need less."""
+        halo = self.method.traits.halo
+        seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
+        part = self.geometry.rows(0, seen)
+        rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
+        return rays + self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
+
+    def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
+        """The method, or its error bars beside its volume."""
+        work = method.memory(geometry, grid, self.weighted)
+        if not self.bars:
+            return work
+        bars = max(error_bars_memory(candidate, geometry, grid) for candidate in candidates_of(method))
+        return max(work, 4 * math.prod(grid.shape) + bars)
+
+    @property
+    def figures(self) -> int:
+        """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
+        odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
+        looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
+        most = max(odd, _REGION * min(math.prod(Grid.matching(self.geometry).shape), _REGIONS), *looks)
+        return most if most > _ASIDE else 0
+
+    @property
+    def least(self) -> int:
+        """The least memory that suffices."""
+        return max(self.parts.values())
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Bytes of each part that must fit alone, by what an error calls it."""
+        views = f"{self.geometry.n_views} views of {self.geometry.detector_shape[1]} columns"
+        return {
+            f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
+            "the correction of a view": self.view + self.steps.correcting,
+            f"the step {self.largest_step}": self._alone,
+            "the measurement of the volume": self.figures,
+        }
+
+    def height(self, memory: int) -> int:
+        """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
+        for parts in range(1, self.rows // _ROWS + 2):
+            height = math.ceil(self.rows / parts / _ROWS) * _ROWS
+            if self.slab(height) <= memory:
+                return height
+        return _ROWS
+
+    def _grid(self, rows: int) -> Grid:
+        return Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
+
+
+def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
+    """The method for so many slices `of` a volume; slabs, with the slices that they share, have so many `in_all`."""
+    return method.for_part(slices / of, slices / in_all) if isinstance(method, DividedMethod) else method
+
+
+def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
+    """The needs of a reconstruction of the chosen views, before any frame is read.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+    """
+    selection = options.selection
+    rows, frames = rows_of(source, selection), np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    chosen = choose_views(source, frames, selection).size
+    views = chosen + views_of_others(options.source, selection)
+    shape = (rows.stop - rows.start) // selection.binning, source.shape[1] // selection.binning
+    axis = source.axis_col if selection.axis_col is None else selection.axis_col
+    if axis is not None:
+        axis = (axis - (selection.binning - 1) / 2) / selection.binning
+    pixel = source.dtype.itemsize if selection.binning == 1 else 4
+    pixel = pixel if source.emission is None else _EMISSION
+    needs = ReconMemory.of(options.method, views, shape, pixel, axis)
+    part = ScanPart(source, selection, needs.geometry)
+    stated = {step.name: step.memory(part) for step in in_order(selection)}
+    return replace(
+        needs,
+        raw=needs.raw * chosen // max(views, 1),  # a scan at a time
+        method=options.method_for(needs.geometry),
+        steps=StepMemory.of_all(stated.values()),
+        largest_step=max(stated, key=lambda name: stated[name].alone),
+        bars=options.uncertainty,
+    )
+
+
+def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
+    """Whether it is known before reading that rays have weights, as of turned views."""
+    turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
+    return turned and not options.method.traits.direct
+
+
+def memory_of(options: ReconOptions) -> int:
+    """Bytes that this process may use, and each worker on this machine or job of Slurm."""
+    if options.memory is not None:
+        return options.memory
+    free = free_memory()
+    return round(SHARE * (free if options.cluster is None else cluster().memory_of_each(options.cluster, free)))
+
+
+def refuse_few_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
+    """Raises DataError, before these views are corrected, where they are too few for several volumes."""
+    method = options.method
+    if not method.traits.several or not isinstance(method, CostedMethod):
+        return
+    try:
+        method.costs(geometry, Grid.matching(geometry))
+    except ValueError as error:
+        raise DataError(
+            f"{source.path} cannot be reconstructed by {method.name}: {error}. Nothing was written."
+        ) from error
+
+
+def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
+    """Raises ConfigError for a method and for options that need everything in memory."""
+    refuse_few_views(source, options, needs.geometry)
+    if (traits := options.method.traits).several:
+        fewer = int(needs.rows * memory / needs.at_once)
+        rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
+        of = "in time" if traits.in_time else "of materials"
+        raise ConfigError(
+            f"{count(volumes_of(options.method), 'volume')} {of} of {Grid.matching(needs.geometry).shape} voxels "
+            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes {of} are not made in slabs: "
+            f"give {rows}--bin. Nothing was written."
+        )
+    poses = stated_poses(source, options.selection)
+    whole = {
+        **{f"{step.asked_by} with roll or tilt": step.may_lean for step in geometry_steps(options.selection)},
+        "--poses with roll, tilt or vectors": poses is not None and poses.leans,
+        "--budget": options.budget is not None,
+        "--checkpoint and --resume": options.checkpoints.wanted,
+        "--early-stop": options.stops_early,
+    }
+    for option, given in whole.items():
+        if given:
+            raise ConfigError(
+                f"{option} needs the whole scan in memory: {source.path} takes {size(needs.at_once)}, {size(memory)} "
+                f"may be used. Leave it out, or give --bin {2 * options.selection.binning} or --rows."
+            )
+
+
+def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning: int) -> None:
+    """Raises DataError if the smallest slab does not fit, with a remedy."""
+    if needs.least <= memory:
+        return
+    cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
+    raise DataError(
+        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} takes {size(needs.least)} of memory, "
+        f"{size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if there is as much, "
+        f"or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+    )
+
+
+def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: ReconMemory, memory: int) -> None:
+    """Raises DataError if the slabs of a partial volume do not fit."""
+    if (wanted := needs.slab(slabs[0].own.stop)) > memory:
+        raise DataError(
+            f"The slabs of {path} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
+            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+        )

@@ -1,0 +1,88 @@
+"""What `beamline simulate` is asked for, and how it tells its results: of scenes of frames, and of a feature's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import click
+
+from beamline.cli.options import json_option, set_by
+from beamline.core.events import Event, Sink
+from drivers.base.clock import Clock
+
+_OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
+_VIEWS = click.IntRange(1)
+_SEED = click.IntRange(0, 2**63 - 1)
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+def _print_effects(ctx: click.Context, param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        from beamline.scenes.effect_table import effects_text  # here: help needs none of it
+
+        click.echo(effects_text())
+        ctx.exit()
+
+
+@dataclass(frozen=True, eq=False)
+class SimulateRequest:
+    """What `beamline simulate` is asked for."""
+
+    scene: str = set_by(click.argument("scene", metavar="SCENE"))
+    explains: bool = set_by(
+        click.option(
+            "--effects",
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_effects,
+            help="Print all effects that a scene may name, with their parameters, and end.",
+        ),
+        "--explain",
+        is_flag=True,
+        help="Print the steps of computing a frame, in order, with the time of each.",
+    )
+    views: int | None = set_by(
+        "--frames",
+        type=_VIEWS,
+        metavar="N",
+        help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
+    )
+    out: Path | None = set_by(
+        "-o", "--output", "--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
+    )
+    truth: Path | None = set_by(
+        "--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file."
+    )
+    truth_bin: int | None = set_by(
+        "--truth-bin",
+        type=click.IntRange(min=1),
+        help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 "
+        "voxels.",
+    )
+    picture: Path | None = set_by(
+        "--picture", type=_FILE, help="Write some frames to this PNG file. Default: beside --out."
+    )
+    seed: int = set_by(
+        "--seed", type=_SEED, metavar="N", default=0, show_default=True, help="Seed of all random numbers."
+    )
+    overrides: tuple[str, ...] = set_by("--set", multiple=True, metavar="KEY=VALUE", help=_OVERRIDE_HELP)
+    as_json: bool = set_by(json_option)
+
+
+class Output:
+    """Prints results as lines, and sends them as events to programs."""
+
+    def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
+        self._sink, self._clock, self._plain = sink, clock, plain
+
+    def __call__(self, what: str, text: str) -> None:
+        self.lines(f"{what:<10}{text}")
+
+    def lines(self, text: str) -> None:
+        if self._plain:
+            click.echo(text)
+
+    def event(self, event: Event) -> None:
+        self._sink(replace(event, time=self._clock.now()))

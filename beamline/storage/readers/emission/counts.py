@@ -1,0 +1,89 @@
+"""Emission: counts of lines of response with what their mean holds, in the group /emission of an HDF5 file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.readers.base import WHOLE, EmissionCounts, EmissionOf, Opening, ScanFormat, frame_indices
+from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
+from drivers.base.frame import FrameKind
+
+F32 = NDArray[np.float32]
+GROUP = "emission"
+SETS = ("attenuation", "normalisation", "randoms", "scatter")
+"""Beside the counts [view, row, col]: line integrals of the attenuation, efficiency, mean randoms, mean scatter."""
+
+
+class EmissionSource(StacksSource):
+    """A scan of a sample that emits. Its pixels are line integrals of the activity; `emission` has what was counted."""
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        views = dataset_at(file, f"{GROUP}/counts")
+        super().__init__(
+            path, file, [FrameStack(FrameKind.PROJECTION, views.name, views)], format="emission",
+            facts={"title": f"Emission counts of {path.stem}"},
+        )  # fmt: skip
+        self._counts = views
+        self.dtype, self.quantity = np.dtype(np.float32), "line_integrals"
+        self._sets = {name: dataset for name in SETS if (dataset := hdf5.dataset(file, f"{GROUP}/{name}")) is not None}
+        for name, dataset in self._sets.items():
+            hdf5.require_real(dataset.dtype, f"{dataset.name} in {path}")
+            if dataset.shape != views.shape:
+                raise DataError(f"{path}: {name} has shape {dataset.shape}, the counts {views.shape} [view, row, col].")
+        angles = hdf5.radians(dataset_at(file, f"{GROUP}/angles"))
+        if angles.shape != self.angles.shape:
+            raise DataError(f"{path}: {angles.size} angles for {self.angles.size} views; expected one for each.")
+        self.angles = angles
+        self.pixel_size_mm = hdf5.scalar(file, f"{GROUP}/pixel_size", {"mm": 1.0})
+        self.axis_col = (self.shape[1] - 1) / 2
+
+    @property
+    def checksummed(self) -> bool:
+        return all(item.fletcher32 for item in (self._counts, *self._sets.values()))
+
+    @property
+    def emission(self) -> EmissionOf:
+        return self._counted
+
+    def _counted(self, frames: NDArray[np.int64], rows: slice) -> EmissionCounts:
+        counts = super().read(frames, rows)
+        sets = dict.fromkeys(SETS, np.zeros_like(counts)) | {"normalisation": np.ones_like(counts)}
+        for name, item in self._sets.items():
+            sets[name] = np.empty_like(counts)
+            hdf5.read_frames(item, frames, rows, sets[name])
+        survival = sets["normalisation"] * np.exp(-sets["attenuation"])
+        return EmissionCounts(counts, survival, sets["randoms"] + sets["scatter"])
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Line integrals of the activity [frame, row, col], in counts; NaN where nothing survives."""
+        counted = self._counted(frame_indices(frames, self.image_key.size), rows)
+        lines = np.full_like(counted.counts, np.nan)
+        return np.divide(counted.counts - counted.background, counted.survival, out=lines, where=counted.survival > 0)
+
+
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not path.is_file() or not hdf5.is_hdf5(path, opening.follow):
+        return False
+    with hdf5.open_hdf5(path, opening.follow) as file:
+        return hdf5.dataset(file, f"{GROUP}/counts") is not None
+
+
+def _open(path: Path, opening: Opening) -> EmissionSource:
+    if opening.follow:
+        raise DataError(f"{path} holds counts of an emission, which do not grow. Leave out --follow.")
+    file = hdf5.open_hdf5(path)
+    try:
+        return EmissionSource(path, file)
+    except BaseException:
+        file.close()
+        raise
+
+
+FORMAT = ScanFormat("/emission/counts (emission)", _recognises, _open)

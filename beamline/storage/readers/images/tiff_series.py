@@ -1,0 +1,268 @@
+"""TIFF series: a folder (or .zip) with one image a file.
+
+The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
+order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
+the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import math
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from tifffile import TiffFile, natural_sorted
+
+from beamline.core.errors import DataError
+from beamline.core.files import TEXT, decoded
+from beamline.core.text import size, spans
+from beamline.storage import hdf5
+from beamline.storage.hdf5 import UnreadableError, require_real
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.images.image_names import angles_of, kinds_of, without_angle
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
+from beamline.storage.writers.ending import ScanEnding
+from drivers.base.frame import FrameKind
+
+MOST_FILES = 100_000
+LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
+_LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
+_MOST_NUMBERS = 2**20  # from the first number of a series to its last
+_TRIED = 3  # first images of a series, of which one must be readable, as the others are then
+COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
+ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+
+
+class TiffSeriesSource(ScanSource):
+    """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series."""
+
+    format = "tiff_series"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._zip = _open_zip(path) if path.is_file() else None
+        try:
+            names = self._names()
+            images = natural_sorted(name for name in names if name.lower().endswith(SUFFIXES))
+            kinds = kinds_of(path, images)
+            series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
+            _check_one_series(path, series)
+            with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
+                refuse_volume(path, tif)
+            in_names = angles_of(series)
+            if in_names is not None:  # their angle does not say their order
+                rest = [without_angle(name) for name in series]
+                place = {name: i for i, name in enumerate(natural_sorted(set(rest)))}
+                taken = np.argsort([place[name] for name in rest], kind="stable")
+                series, in_names = [series[i] for i in taken], in_names[taken]
+            order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
+            self._files = order + series
+            self.in_order, self.numbers = not order, _numbers_of_frames(order, series)
+            self.image_key = np.array([kinds[name] for name in self._files], np.int32)
+            self.angles = np.full(len(self._files), np.nan)
+            if in_names is not None:
+                self.angles[len(order) :] = in_names
+            self.exposures = np.full(len(self._files), np.nan)
+            some = order[:: len(order) // _REFERENCES + 1]
+            samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
+            self.shape = samples[-1][0]
+            self.dtype = np.result_type(*(dtype for _, dtype in samples))
+            self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
+        except BaseException:
+            self.close()
+            raise
+        numbers = _numbers(series if in_names is None else [without_angle(name) for name in series])
+        if numbers is not None and np.ptp(numbers) >= _MOST_NUMBERS:
+            numbers = None  # dates and serial numbers count no images
+        left_out = [] if numbers is None else sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()})
+        gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
+        self._missing = tuple(before + number for number in left_out)
+        self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
+        if in_names is not None and len(self._texts) != 1:
+            self.facts |= {"angles_from": "the names of the files"}
+
+    @property
+    def ending(self) -> ScanEnding:
+        return ScanEnding(missing=self._missing)
+
+    @property
+    def angle_text(self) -> tuple[str, str] | None:
+        """Name and content of the one file that is named after angles, or None. DataError: it is too large for them."""
+        return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        indices = frame_indices(frames, self.image_key.size)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for i, number in enumerate(indices):
+            name = self._files[number]
+            image = self._image(name)
+            if image.shape != self.shape:
+                raise DataError(f"{name} in {self.path} is {image.shape}; the other frames are {self.shape}.")
+            if not np.can_cast(image.dtype, self.dtype):
+                raise DataError(
+                    f"{name} in {self.path} holds {image.dtype} pixels, the frames before it {self.dtype}, which "
+                    "cannot hold them all. Write all images of a scan in one type."
+                )
+            out[i] = image[rows]
+        return out
+
+    def close(self) -> None:
+        if self._zip is not None:
+            self._zip.close()
+
+    def _names(self) -> list[str]:
+        if self._zip is not None:
+            packed = (name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name)
+            return [name for name in packed if not is_hidden(name)]
+        names = []
+        for n, item in enumerate(self.path.rglob("*")):
+            _refuse_more(self.path, n)
+            if not is_hidden(item.name) and item.is_file():
+                names.append(item.relative_to(self.path).as_posix())
+        return names
+
+    def _bytes(self, name: str, most: int) -> bytes:
+        try:
+            with self._opened(name, most) as file:
+                return file.read(min(most, self._size(name)))
+        except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
+            raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+
+    def _size(self, name: str) -> int:
+        return (self.path / name).stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
+
+    def _opened(self, name: str, most: int) -> IO[bytes]:
+        """A file of the series, of so many bytes at most."""
+        if (n := self._size(name)) > most:
+            raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
+        return (self.path / name).open("rb") if self._zip is None else self._zip.open(name)
+
+    @contextmanager
+    def _tiff(self, name: str) -> Iterator[TiffFile]:
+        """The head of an image, whose pixels are not read."""
+        try:
+            with self._opened(name, LARGEST_IMAGE) as file, TiffFile(file) as tif:
+                yield tif
+        except (*UNREADABLE, RuntimeError) as error:
+            raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+
+    def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
+        """Shape and type of the images of these files that can be read, by their heads; DataError where they are fewer
+        than `at_least`.
+
+        Of many bytes the first ones: to tell their type takes no more.
+        """
+        images, failed, looked = list[tuple[tuple[int, int], np.dtype[Any]]](), list[UnreadableError](), 0
+        for name in names:
+            if images and looked > _LOOKED:
+                break
+            looked += self._size(name)
+            try:
+                with self._tiff(name) as tif:
+                    shape, dtype = image_of(tif)
+                images.append((self._require_grey(name, shape, dtype), dtype))
+            except UnreadableError as error:
+                failed.append(error)
+        if len(images) < at_least:
+            raise failed[0]
+        return images
+
+    def _text(self, name: str) -> str:
+        content = self._bytes(name, TEXT)
+        try:
+            return decoded(content)
+        except UnicodeDecodeError:
+            return content.decode("utf-8", "replace")  # a comment in another alphabet; numbers are told later
+
+    def _image(self, name: str) -> NDArray[Any]:
+        content = self._bytes(name, LARGEST_IMAGE)
+        try:
+            image = read_image(io.BytesIO(content), LARGEST_IMAGE)
+        except UNREADABLE as error:
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+        self._require_grey(name, image.shape, image.dtype)
+        return image
+
+    def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
+        if not shape or math.prod(shape) == 0:
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
+        if len(shape) != 2:
+            raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
+        require_real(dtype, f"{name} in {self.path}")
+        return shape
+
+
+def _open_zip(path: Path) -> zipfile.ZipFile:
+    try:
+        _refuse_more(path, _entries(path))
+        return zipfile.ZipFile(path)
+    except UNREADABLE as error:
+        raise DataError(f"{path} cannot be read as a zip file ({hdf5.reason(error)}).") from error
+
+
+def _refuse_more(path: Path, n: int) -> None:
+    if n > MOST_FILES:
+        raise DataError(f"{path} holds more than {MOST_FILES} files: it is no scan. Give the folder of its images.")
+
+
+def _entries(path: Path) -> int:
+    """How many files a .zip says at its end that it holds (APPNOTE 4.3.14 and 4.3.16); to read its list takes long."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 2**16 - 42))
+        tail = file.read()
+        end = tail.rfind(b"PK\5\6")
+        n = 0 if end < 0 else int.from_bytes(tail[end + 10 : end + 12], "little")
+        if n == 0xFFFF and tail[end - 20 : end - 16] == b"PK\6\7":
+            file.seek(int.from_bytes(tail[end - 12 : end - 4], "little"))
+            n = int.from_bytes(file.read(56)[32:40], "little")
+    return n
+
+
+def _prefix(name: str) -> str:
+    return re.sub(r"\d+(?=\.\w+$)", "", name)
+
+
+def _check_one_series(path: Path, names: list[str]) -> None:
+    if not names:
+        raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
+    prefixes = sorted({_prefix(name) for name in names})
+    if len(prefixes) > 1 and (angles_of(names) is None or len({_prefix(without_angle(name)) for name in names}) > 1):
+        numbers = ", ".join(
+            f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6]
+        )
+        raise DataError(
+            f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, "
+            "flat_0001.tif), or give the folder of the projections, and the others apart, with --darks and --flats."
+        )
+
+
+def _numbers_of_frames(references: list[str], series: list[str]) -> NDArray[np.int64] | None:
+    """Numbers of darks and flats, -1 where they do not count with the series, and of the series; None without its."""
+    together, of_series = _numbers(references + series), _numbers(series)
+    if together is not None or of_series is None:
+        return together
+    return np.concatenate([np.full(len(references), -1), of_series])
+
+
+def _numbers(names: list[str]) -> NDArray[np.int64] | None:
+    """The number at the end of each name; None where one has none, or where they are no counts (dates)."""
+    matches = [re.search(r"(\d{1,18})\.\w+$", name) for name in names]
+    numbers = np.array([int(match[1]) for match in matches if match is not None], np.int64)
+    if numbers.size < len(names) or np.ptp(numbers) > COUNTED * numbers.size:
+        return None
+    return numbers
+
+
+FORMAT = ScanFormat(
+    "a folder or .zip of TIFFs",
+    lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
+    lambda path, opening: TiffSeriesSource(path),
+)

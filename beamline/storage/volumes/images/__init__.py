@@ -1,0 +1,11 @@
+"""Volumes as TIFF: one file with a page a slice, or a folder with a file a slice."""
+
+from __future__ import annotations
+
+from beamline.storage.volumes.entry import FormatEntry
+
+_MODULE = "beamline.storage.volumes.images.tiff"
+FORMATS = {
+    "tiff": FormatEntry(_MODULE, "TiffVolume", (".tif", ".tiff")),
+    "tiff_folder": FormatEntry(_MODULE, "TiffFolderVolume", ("",), "a folder of TIFFs"),
+}

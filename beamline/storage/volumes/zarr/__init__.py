@@ -1,0 +1,7 @@
+"""Volumes as OME-Zarr."""
+
+from __future__ import annotations
+
+from beamline.storage.volumes.entry import FormatEntry
+
+FORMATS = {"ome_zarr": FormatEntry("beamline.storage.volumes.zarr.ome_zarr", "OmeZarr", (".zarr",))}

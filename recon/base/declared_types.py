@@ -1,0 +1,216 @@
+"""Declared types: whether a value is of the type that a field or an argument declares, and how a sentence names it.
+
+Of an array only that it is one is looked at: the functions that take it name the shape and the numbers they expect.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import operator
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from functools import cache
+from numbers import Real
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from recon.base.registry import unknown
+
+_ARRAYS = frozenset(get_args(getattr(ArrayLike, "__value__", ArrayLike)))  # numpy names it by `type` from Python 3.12
+_LONGEST = 80  # characters of a value in a sentence
+_WORDS: Mapping[Any, tuple[str, str]] = {
+    bool: ("True or False", "of True and False"),
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    str: ("text", "texts"),
+    NoneType: ("None", "of None"),
+    Callable: ("a function", "functions"),
+    Mapping: ("a mapping", "mappings"),
+    np.ndarray: ("an array", "arrays"),
+}
+"""How one and how several of a type are called."""
+
+
+@cache
+def types_of(owner: Any) -> Mapping[str, Any]:
+    """The declared types of a dataclass's fields or a function's arguments, by name, where they can be resolved."""
+    resolved: dict[str, Any] = {}
+    for each in reversed(inspect.getmro(owner)) if isinstance(owner, type) else (owner,):
+        for name, kind in inspect.get_annotations(each).items():
+            one = type("_One", (), {"__annotations__": {name: kind}})
+            try:
+                resolved |= get_type_hints(one, vars(sys.modules[each.__module__]), {})
+            except NameError:  # a type that is imported for the type checker alone
+                resolved.pop(name, None)
+    return resolved
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a real number, or an array without axes that holds one, as an .npz gives it.
+
+    True and False are none.
+    """
+    value = plain(value)
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def lone(value: Any) -> bool:
+    """Whether it is an array without axes, or numpy's True or False."""
+    return isinstance(value, np.bool_) or (
+        getattr(value, "shape", None) == () and hasattr(value, "item") and not isinstance(value, np.generic)
+    )
+
+
+def plain(value: Any) -> Any:
+    """The number, or True or False, that an array without axes holds; others as they are."""
+    return value.item() if lone(value) else value
+
+
+def is_of_type(value: Any, kind: Any) -> bool:
+    """Whether a value is of a declared type."""
+    origin, args = _parts(kind)
+    if kind is None or kind is NoneType:
+        return value is None
+    if origin in (Union, UnionType):
+        others = _without_arrays(args)
+        return (len(others) < len(args) and _is_numeric(value)) or any(is_of_type(value, each) for each in others)
+    if origin is Literal:
+        return isinstance(value, str | int) and value in args
+    if kind is bool:
+        return isinstance(value, bool | np.bool_)
+    if kind is int:
+        return not isinstance(value, bool) and _is_whole(value)
+    if kind is float:
+        return is_number(value) and not math.isnan(value)
+    if origin is tuple:
+        return _is_sequence(value) and _each_fits(value, args)
+    if origin is Callable:
+        return callable(value)
+    return _is_instance(value, origin) and (not _is_of_sequences(origin, args) or _each_fits(value, (*args, ...)))
+
+
+def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """What a type is made of: its origin or itself, and its arguments; names by `type` (Python 3.12) are unfolded."""
+    kind = getattr(kind, "__value__", kind) if not isinstance(kind, type) else kind
+    origin, args = get_origin(kind) or kind, get_args(kind)
+    if origin in (Union, UnionType):
+        unfolded = [get_args(each.__value__) if hasattr(each, "__value__") else (each,) for each in args]
+        args = tuple(part for parts in unfolded for part in parts)
+    return origin, args
+
+
+def _without_arrays(alternatives: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The alternatives of a type without those of `ArrayLike`, if it has them all."""
+    if not set(alternatives) >= _ARRAYS:
+        return alternatives
+    return tuple(each for each in alternatives if each not in _ARRAYS)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether numpy makes an array of numbers of it."""
+    if value is None or isinstance(value, type) or callable(value):
+        return False
+    try:
+        stated = getattr(getattr(value, "dtype", None), "kind", None)  # of a data set in a file, which is not read
+        return (stated or np.asarray(value).dtype.kind) in "biufc"
+    except (TypeError, ValueError, RuntimeError):
+        return False
+
+
+def _is_whole(value: Any) -> bool:
+    try:
+        operator.index(value)
+    except TypeError:
+        return False
+    return True
+
+
+def _is_sequence(value: Any) -> bool:
+    """Also an array, which is no `Sequence`."""
+    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and not isinstance(value, str | bytes | Mapping)
+
+
+def _is_of_sequences(origin: Any, args: tuple[Any, ...]) -> bool:
+    return isinstance(origin, type) and issubclass(origin, Sequence) and origin is not str and len(args) == 1
+
+
+def _each_fits(values: Any, kinds: tuple[Any, ...]) -> bool:
+    if len(kinds) == 2 and kinds[1] is ...:
+        return all(is_of_type(value, kinds[0]) for value in values)
+    return len(values) == len(kinds) and all(map(is_of_type, values, kinds))
+
+
+def _is_instance(value: Any, kind: Any) -> bool:
+    if kind is np.ndarray:
+        return hasattr(value, "__array__")
+    if kind is Any or not isinstance(kind, type) or str(kind.__module__).startswith("numpy"):
+        return True  # such as a type variable
+    if issubclass(kind, Enum):
+        return isinstance(value, kind) or value in [member.value for member in kind]
+    if getattr(kind, "_is_protocol", False):
+        if kind.__module__ in ("typing", "collections.abc"):
+            return isinstance(value, kind)
+        bases = [base for base in kind.__mro__ if getattr(base, "_is_protocol", False)]
+        names = {name for base in bases for name in (*vars(base), *inspect.get_annotations(base)) if name[0] != "_"}
+        return not isinstance(value, type) and all(hasattr(value, name) for name in names)
+    if issubclass(kind, Sequence) and kind is not str:
+        return _is_sequence(value)
+    return isinstance(value, kind)
+
+
+def words(kind: Any, several: bool = False) -> str:
+    """What a value of a declared type is called, such as "a whole number or None"."""
+    origin, args = _parts(kind)
+    if origin in (Union, UnionType):
+        others = _without_arrays(args)
+        named = ["an array of numbers"] if len(others) < len(args) else []
+        named += [words(each, several) for each in sorted(others, key=lambda each: each is NoneType)]
+        return f"{', '.join(named[:-1])} or {named[-1]}" if len(named) > 1 else named[0]
+    if origin is Literal:
+        return " or ".join(map(repr, args))
+    if origin is tuple and args[-1:] != (...,):
+        return f"{len(args)} {words(args[0], True)}"
+    if origin is tuple or _is_of_sequences(origin, args):
+        return f"a list or tuple of {words(args[0], True)}"
+    if origin in _WORDS:
+        return _WORDS[origin][several]
+    name = getattr(origin, "__name__", str(origin))
+    return f"{name}s" if several else f"{'an' if name[:1] in 'AEIO' else 'a'} {name}"
+
+
+def refusal(name: str, value: Any, kind: Any) -> str:
+    """Why a value is not taken; without a full stop."""
+    of = tuple(each for each in (get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)) if each)
+    names = [member for each in of if get_origin(each) is Literal for member in get_args(each)]
+    names += [member.value for each in of if isinstance(each, type) and issubclass(each, Enum) for member in each]
+    if names and all(isinstance(member, str) for member in names):
+        return unknown(name, value, names)
+    instead = f"; give an object, such as {value.__name__}()" if isinstance(value, type) else ""
+    return f"{name} must be {words(kind)}, got {shown(value)}{instead}"
+
+
+def shown(value: object) -> str:
+    """A value in a sentence."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if (shape := getattr(value, "shape", None)) not in (None, ()):
+        return f"{type(value).__name__} of shape {shape}"
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+
+
+def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
+    """Raise ValueError for an argument of another type than the function declares.
+
+    Args:
+        values: by name, such as `locals()` in the function's first line.
+    """
+    kinds = types_of(function)
+    for name, value in values.items():
+        if name in kinds and not is_of_type(value, kinds[name]):
+            raise ValueError(refusal(name, value, kinds[name]))

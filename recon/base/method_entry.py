@@ -1,0 +1,26 @@
+"""MethodEntry: the line of a method in the registry of methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """Where a method is.
+
+    Attributes:
+        module, cls: of its settings class, see `recon.base.method.Method`.
+        streams: it has `stream`, so that its volume can grow while views arrive.
+        compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
+        emission: it is compared where the sample emits, whatever `compared` says.
+        several: what its volumes are of, where it makes several.
+    """
+
+    module: str
+    cls: str
+    streams: bool = False
+    compared: bool = True
+    emission: bool = False
+    several: Literal["", "times", "materials"] = ""

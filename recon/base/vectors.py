@@ -1,0 +1,167 @@
+"""Vectors of each view: source or ray, detector, columns and rows, as ASTRA and what builds on it state a geometry.
+
+One row a view, lengths in one unit, (x, y, z) about the middle of the volume (ASTRA Toolbox, 3D geometries,
+`parallel3d_vec` and `cone_vec`):
+
+    ray or source   direction of the parallel beam, or place of the source
+    d               middle of the detector
+    u, v            from one pixel to the next one of its row, and of its column
+
+So the middle of pixel (row, col) is d + (col - (cols - 1) / 2) u + (row - (rows - 1) / 2) v. A volume [z, y, x] is the
+same array in both. ASTRA has projections as [row, view, col]; tomosipo writes vectors as (z, y, x).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from recon.base.arrays import F64
+from recon.base.declared_types import check_arguments
+from recon.base.geometry import Geometry, Where
+
+TOLERANCE = 0.1
+"""Pixels by which a corner of the detector may lie off the one that the vectors state."""
+
+_FLAT = 1e-6  # of u, or v: what is left of the other one
+_CLEAN = 1e-9  # rad, pixels, or of the distance to the source: what is less is rounding
+
+
+def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, cone: bool) -> Geometry:
+    """The geometry of views that vectors describe: any direction of a parallel beam, any source of a cone.
+
+    Detectors have square pixels of one size. That of a parallel beam stands across the beam; that of a cone has one
+    distance from its source in all views, and need not face the origin.
+
+    Args:
+        vectors: float [view, 12], in mm; see the module.
+        detector_shape: (rows, cols) in pixels.
+        cone: the first three are the source; else the direction of the beam, either way along it.
+
+    Raises:
+        ValueError: vectors that are not finite [view, 12], or a view that is no such detector within `TOLERANCE`.
+    """
+    check_arguments(geometry_of_vectors, locals())
+    given = np.asarray(vectors, np.float64)
+    rows, cols = detector_shape
+    if given.ndim != 2 or given.shape[1] != 12 or not len(given):
+        raise ValueError(f"vectors have shape {given.shape}; expected [view, 12]: ray or source, d, u and v")
+    if not np.isfinite(given).all():
+        bad = int(np.flatnonzero(~np.isfinite(given).all(axis=1))[0])
+        raise ValueError(f"the vectors of view {bad} are not finite: {given[bad].tolist()}")
+    first, middle, u, v = given.reshape(-1, 4, 3).transpose(1, 0, 2)
+    if not cone:
+        u, v = (_across(vector, first) for vector in (u, v))
+    frame = _frame(u, v)
+    along_cols, along_rows, beam = frame
+    sizes = (_dot(u, along_cols) + _dot(v, along_rows)) / 2
+    distances = _distances(middle - first, beam) if cone else np.ones(len(given))
+    sdd = float(np.median(distances))
+    apart = (sdd / distances)[:, None]  # what a detector at the common distance has in place of 1
+    pitch = float(np.median(sizes * apart[:, 0]))
+    _require_pixels(u * apart, v * apart, frame, pitch, (rows, cols))
+    foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # its pixel is that of the origin
+    at = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
+    at += (cols - 1) / 2, (rows - 1) / 2
+    axis_col, axis_row = np.median(at, axis=0)
+    theta, roll, tilt = _angles(*frame)
+    where = Where(
+        axis_col=axis_col, axis_row=axis_row, shifts=_clean(at - (axis_col, axis_row)), roll=roll, tilt=tilt
+    )  # fmt: skip
+    if not cone:
+        return Geometry.parallel(theta, (rows, cols), pixel_pitch=pitch, **where)
+    sod = float(np.median(-_dot(first, beam)))
+    if not 0 < sod <= sdd * (1 + _CLEAN):
+        raise ValueError(
+            f"the middle of the volume lies {sod:.6g} mm from the sources, whose detectors lie at {sdd:.6g}: expected "
+            "it in between. Measure all vectors from a point of the sample"
+        )
+    centres = first + sod * beam
+    centres[np.abs(centres).max(axis=1) < _CLEAN * sod] = 0
+    return Geometry.cone(theta, (rows, cols), pitch, min(sod, sdd), sdd, **where).about(centres)
+
+
+def vectors_of(geometry: Geometry) -> F64:
+    """The vectors [view, 12] of a geometry, in mm; of a parallel beam the first three are its direction.
+
+    Raises:
+        ValueError: rows that were read one after the other, each at an angle of its own.
+    """
+    check_arguments(vectors_of, locals())
+    if geometry.skew:
+        raise ValueError("the rows of these views stand at angles of their own, which vectors of a view cannot say")
+    rows, cols = geometry.detector_shape
+    axes = np.array([geometry.axes(view) for view in range(geometry.n_views)])
+    along_cols, along_rows, beam = axes.transpose(1, 0, 2)
+    off = np.array([geometry.origin(view) for view in range(geometry.n_views)]) - ((cols - 1) / 2, (rows - 1) / 2)
+    middle = -geometry.pixel_pitch * (off[:, :1] * along_cols + off[:, 1:] * along_rows)
+    first = beam
+    if geometry.is_cone:
+        first = geometry.centres - geometry.sod * beam
+        middle += first + geometry.sdd * beam
+    return np.hstack((first, middle, geometry.pixel_pitch * along_cols, geometry.pixel_pitch * along_rows))
+
+
+def _dot(a: F64, b: F64) -> F64:
+    return np.asarray(np.einsum("vi,vi->v", a, b))
+
+
+def _clean(values: F64) -> F64:
+    return np.where(np.abs(values) < _CLEAN, 0.0, values)
+
+
+def _across(vectors: F64, rays: F64) -> F64:
+    """What a parallel beam sees of vectors: their parts across its rays."""
+    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
+    if not lengths.all():
+        raise ValueError(f"view {int(np.flatnonzero(lengths == 0)[0])}: the direction of the beam is zero")
+    along = rays / lengths
+    return vectors - _dot(vectors, along)[:, None] * along
+
+
+def _frame(u: F64, v: F64) -> tuple[F64, F64, F64]:
+    """The orthonormal pair nearest to each (u, v), by their polar decomposition, and the beam onto such a detector."""
+    left, sizes, right = np.linalg.svd(np.stack((u, v), axis=2), full_matrices=False)
+    flat = sizes[:, 1] <= _FLAT * sizes[:, 0]
+    if flat.any():
+        view = int(np.flatnonzero(flat)[0])
+        raise ValueError(f"view {view}: u and v are zero, parallel, or along the beam: {u[view]} and {v[view]}")
+    along_cols, along_rows = (left @ right).transpose(2, 0, 1)
+    return along_cols, along_rows, np.cross(along_rows, along_cols)
+
+
+def _distances(to_detector: F64, beam: F64) -> F64:
+    """mm from the sources of a cone to their detectors."""
+    distances = _dot(to_detector, beam)
+    if (distances <= 0).any():
+        raise ValueError(
+            f"view {int(np.flatnonzero(distances <= 0)[0])}: u, v and the direction from source to detector "
+            "have the wrong handedness, as in a mirrored image. Where rows count from the top, reverse the rows and v "
+            "of all views"
+        )
+    return distances
+
+
+def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, shape: tuple[int, int]) -> None:
+    """ValueError where a detector's corners differ by more than `TOLERANCE` from those of square pixels of `size`."""
+    by_col, by_row = ((vector - size * unit) / size for vector, unit in zip((u, v), frame, strict=False))
+    rows, cols = shape
+    corners = [by_col * cols / 2 + sign * by_row * rows / 2 for sign in (1, -1)]
+    off = np.linalg.norm(corners, axis=2).max(axis=0)
+    view = int(np.argmax(off))
+    if off[view] > TOLERANCE:
+        raise ValueError(
+            f"view {view}: a corner of its detector lies {off[view]:.3g} pixels from that of square pixels of "
+            f"{size:.6g}, which all views share; expected at most {TOLERANCE}. Resample the views to such a detector"
+        )
+
+
+def _angles(along_cols: F64, along_rows: F64, beam: F64) -> tuple[F64, F64, F64]:
+    """Angle, roll and tilt of each view, as of `Geometry.axes`."""
+    tilt = -np.arcsin(np.clip(beam[:, 2], -1, 1))
+    upright = np.hypot(beam[:, 0], beam[:, 1]) < 1e-12  # along the axis: roll and angle turn alike
+    theta = np.where(upright, np.arctan2(along_cols[:, 1], along_cols[:, 0]), np.arctan2(-beam[:, 0], beam[:, 1]))
+    c, s = np.cos(theta), np.sin(theta)
+    level = np.stack((c, s, np.zeros_like(c)), 1)
+    roll = np.arctan2(-_dot(along_rows, level), _dot(along_cols, level))
+    return np.unwrap(theta), _clean(roll), _clean(tilt)

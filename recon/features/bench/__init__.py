@@ -1,0 +1,1 @@
+"""Speed and quality of a standard case on this machine."""

@@ -1,0 +1,214 @@
+"""Joint steps: the volume and the geometry together, by least squares on the views.
+
+    min over (y, c)  ‖ p - A(g) x - A(g) y - J c ‖²_W        J: what a change c of the geometry does to the images of x
+
+An alternation of volume and geometry would be slow where the volume can hide an error: a slow drift looks like a
+slightly blurred sample. Here both are unknowns of one system, which conjugate gradients solve (Gauss-Newton; the
+geometry's part of bundle adjustment). W is the ramp of filtered back-projection along the columns, so that AᵀWA is near
+the identity and ten steps suffice. CG starts from no change. So it does not move along what the views cannot tell.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.features.calibration.freedom import moved, slopes
+from recon.voxels.fbp import ramp
+from recon.voxels.projector import Projector, projection_lines
+
+_TRIAL = 0.25  # pixels at an image's edge, for the derivative by tilt
+_MARGIN = 3  # slices beyond the rows at either end
+_FLOOR = 0.05  # of the typical view's information: a view without matter does not move
+
+
+@dataclass(eq=False)
+class JointFit:
+    """A volume [y, x, z] and the geometry of some views, improved together step by step.
+
+    Attributes:
+        data: [view, col, row], line integrals.
+        known: [view, col, row] weights of rays; None: one for all.
+        terms: of `freedom.TERMS`, which may change.
+        volume: the best so far.
+        turned: the data as a detector without roll would have taken them.
+    """
+
+    data: F32
+    geometry: Geometry
+    terms: frozenset[str]
+    grid: Grid
+    known: F32 | None = None
+    volume: F32 = field(init=False)
+    turned: F32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        nz, ny, nx = self.grid.shape
+        self.volume = np.zeros((ny, nx, nz), np.float32)
+        self.turned = _turned_back(self.data, self.geometry) if self.geometry.roll.any() else self.data
+
+    @classmethod
+    def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None) -> JointFit:
+        """Of views [view, row, col]."""
+        tall = taller(Grid.matching(geometry))
+        rays = None if known is None else projection_lines(known)
+        return cls(projection_lines(data), geometry, terms, tall, rays)
+
+    def weighed(self, images: F32) -> F32:
+        """W images."""
+        if self.known is None:
+            return _ramp(images)
+        return self.known * _ramp(self.known * images)
+
+    def step(self, rounds: int, farthest: float) -> None:
+        """One step of Gauss-Newton on the volume, and on the geometry where the volume is not zero.
+
+        Args:
+            rounds: of conjugate gradients.
+            farthest: pixels that anything may move.
+        """
+        model = _Model(self.geometry, self.grid)
+        images, free = model.forward(self.volume), dict[str, F32]()
+        if self.terms and self.volume.any():
+            by_tilt = model.by_tilt(self.volume) if "tilt" in self.terms else None
+            free = slopes(images, model.geometry, by_tilt, self.terms)
+        y, c = _solved(model, free, self.weighed, self.turned - images, rounds)
+        self.volume += y
+        np.maximum(self.volume, 0, out=self.volume)
+        if free:
+            self.geometry = moved(self.geometry, c, farthest)
+            if {"col", "roll"} & set(free) and self.geometry.roll.any():
+                self.turned = _turned_back(self.data, self.geometry)
+
+
+def taller(grid: Grid) -> Grid:
+    """The grid with more slices at either end, for rays of views that lean or are shifted."""
+    return replace(grid, shape=(grid.shape[0] + 2 * _MARGIN, *grid.shape[1:]))
+
+
+class _Model:
+    """Images [view, col, row] of a volume [y, x, z] without roll, and the transpose.
+
+    A tilt of a parallel beam is taken to first order: it displaces what a voxel adds to an image along the rows by the
+    voxel's depth times the tilt. So images of the volume times x and times y suffice.
+    """
+
+    def __init__(self, geometry: Geometry, grid: Grid) -> None:
+        self.geometry = geometry.straightened()
+        self._tilt, self._grid = float(geometry.tilt[0]), grid
+        exact = replace(self.geometry, tilt=geometry.tilt) if geometry.is_cone else self.geometry
+        self._projector = Projector(exact, grid)
+        _, y, x = (axis.astype(np.float32) / np.float32(geometry.pixel_pitch) for axis in grid.coordinates())
+        self._x, self._y = x[None, :, None], y[:, None, None]
+        self._cos, self._sin = (f(geometry.angles).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
+
+    def forward(self, volume: F32) -> F32:
+        images = self._projector.forward_lines(volume)
+        if self._tilt and not self.geometry.is_cone:
+            images += np.float32(self._tilt) * self.by_tilt(volume)
+        return images
+
+    def adjoint(self, images: F32) -> F32:
+        volume = self._projector.adjoint_lines(images)
+        if self._tilt and not self.geometry.is_cone:
+            moved = np.float32(self._tilt) * _along_rows(images)
+            volume += self._y * self._projector.adjoint_lines(moved * self._cos)
+            volume -= self._x * self._projector.adjoint_lines(moved * self._sin)
+        return volume
+
+    def by_tilt(self, volume: F32) -> F32:
+        """The derivative of the images by tilt, a radian."""
+        if self.geometry.is_cone:
+            trial = _TRIAL / max(self.geometry.detector_shape)
+            there, back = (
+                Projector(replace(self.geometry, tilt=self._projector.geometry.tilt + t), self._grid)
+                for t in (trial, -trial)
+            )
+            return (there.forward_lines(volume) - back.forward_lines(volume)) / np.float32(2 * trial)
+        by_x, by_y = (self._projector.forward_lines(volume * at) for at in (self._x, self._y))
+        return -_along_rows(by_y * self._cos - by_x * self._sin)
+
+
+def _along_rows(images: F32) -> F32:
+    """Slopes along the rows by central differences of fourth order; 0 beyond them."""
+    out = np.zeros_like(images)
+    for reach, share in ((1, 8 / 12), (2, -1 / 12)):
+        out[..., :-reach] += np.float32(share) * images[..., reach:]
+        out[..., reach:] -= np.float32(share) * images[..., :-reach]
+    return out
+
+
+def _turned_back(data: F32, geometry: Geometry) -> F32:
+    """Views [view, col, row] as a detector without roll would have taken them (cubic)."""
+    out = np.empty_like(data)
+    for view in range(len(data)):
+        c, s = math.cos(geometry.roll[view]), math.sin(geometry.roll[view])
+        turn, origin = np.array([[c, s], [-s, c]]), np.array(geometry.origin(view))
+        out[view] = ndimage.affine_transform(data[view], turn, origin - turn @ origin, mode="nearest")
+    return out
+
+
+def _ramp(images: F32) -> F32:
+    cols = images.shape[1]
+    n = fft.next_fast_len(2 * cols, real=True)
+    spectrum = fft.rfft(images, n, axis=1, workers=get_num_threads())
+    spectrum *= ramp(n, 1.0, "hann")[:, None]
+    return np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
+
+
+def _solved(
+    model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], left: F32, rounds: int
+) -> tuple[F32, dict[str, F64]]:
+    """The change of the volume, and of each free quantity: [view] for the places of views, [1] for the others."""
+    first = model.adjoint(weighed(left))
+    seen = model.forward(first)
+    typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
+    scale: dict[str, NDArray[np.float64]] = {}
+    for name, slope in free.items():
+        told = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
+        told = np.maximum(told, _FLOOR * np.median(told)) if name in ("col", "row") else told.sum(keepdims=True)
+        scale[name] = np.sqrt(typical / np.maximum(told, 1e-30))
+
+    def back(images: F32) -> tuple[F32, dict[str, F64]]:
+        values = {}
+        for name, slope in free.items():
+            each = np.einsum("vcr,vcr->v", slope, images).astype(np.float64)
+            values[name] = scale[name] * (each if scale[name].size > 1 else each.sum(keepdims=True))
+        return model.adjoint(images), values
+
+    def dot(a: tuple[F32, dict[str, F64]]) -> float:
+        return float(np.vdot(a[0], a[0])) + sum(float(v @ v) for v in a[1].values())
+
+    y, c = np.zeros_like(first), {name: np.zeros(s.size) for name, s in scale.items()}
+    gradient = back(weighed(left))
+    along = gradient[0].copy(), {name: v.copy() for name, v in gradient[1].items()}
+    size = dot(gradient)
+    for _ in range(rounds):
+        if size == 0:
+            break
+        image = model.forward(along[0])
+        for name, slope in free.items():
+            image += slope * (scale[name] * along[1][name]).astype(np.float32)[:, None, None]
+        pulled = weighed(image)
+        far = size / max(float(np.vdot(image, pulled)), 1e-30)
+        y += np.float32(far) * along[0]
+        change = back(pulled)
+        for name in c:
+            c[name] += far * along[1][name]
+            gradient[1][name] -= far * change[1][name]
+        gradient = gradient[0] - np.float32(far) * change[0], gradient[1]
+        before, size = size, dot(gradient)
+        along = (
+            gradient[0] + np.float32(size / before) * along[0],
+            {name: gradient[1][name] + size / before * along[1][name] for name in c},
+        )
+    return y, {name: scale[name] * value for name, value in c.items()}

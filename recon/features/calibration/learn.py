@@ -1,0 +1,257 @@
+"""learn_geometry: a better geometry from line integrals, from coarse to fine pixels, confirmed by views held out.
+
+To confirm it, a volume of the other views predicts those held out. Its method and projector are not those of the search
+(FISTA-TV with exact rays). Each view held out may first be put where it fits best, for either geometry. So its own
+place, which was fitted to it as well, is no advantage: the volumes alone are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from recon.base.arrays import F32, F64
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.volume import Grid
+from recon.features.calibration.freedom import TERMS, GeometryChange, edge_motion
+from recon.features.calibration.joint import JointFit, taller
+from recon.voxels.held_out import beyond_chance
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.projector import Projector
+
+_ONE_IN = 4  # views held out
+_SWEEPS, _TV_WEIGHT = 6, 3e-3
+_EDGE = 1  # row at either end, in which rays of leaning views leave the slices seen
+_SMOOTH = 4.0  # pixels
+_LEAST = 0.002  # share of the squared deviation that a better geometry takes away
+_SURE = 2.0  # see `beyond_chance`
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Deviations of views held out.
+
+    Attributes:
+        views: float32 [view, row, col], line integrals.
+        grid: of all volumes.
+        known: [row, col] weights of pixels; None: one for all.
+        placed: each view held out is first put where it fits best.
+    """
+
+    views: F32
+    grid: Grid
+    known: F32 | None
+    placed: bool
+
+    def deviations(self, geometry: Geometry) -> F64:
+        """[view held out] root mean squares by a volume of the others in this geometry."""
+        order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
+        unseen = order[1::_ONE_IN]
+        rows = geometry.detector_shape[0]
+        seen = np.setdiff1d(order, unseen)
+        use = DataUse()
+        if self.known is not None:
+            use = DataUse(np.broadcast_to(self.known, self.views[seen].shape).copy())
+        problem = ReconProblem(self.views[seen], geometry.select(seen), self.grid, use, 0, "cpu")
+        volume = FistaTv(_SWEEPS, _TV_WEIGHT).run(problem, RunControl()).volume
+        images = Projector(geometry.select(unseen), self.grid).forward(volume.data)
+        known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
+        edge = min(_EDGE, (rows - 1) // 4)
+        known[:edge], known[rows - edge :] = 0, 0
+        return np.array(
+            [self._left(view - image, image, known) for view, image in zip(self.views[unseen], images, strict=True)]
+        )
+
+    def _left(self, left: F32, image: F32, known: F32) -> float:
+        """Root mean square of what is left of a view, after it was put where it fits best."""
+        rays = _without_smooth(left)[known > 0]
+        if self.placed:
+            ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
+            slopes = np.stack([way[known > 0] for way in ways], axis=1)
+            rays = rays - slopes @ np.linalg.lstsq(slopes, rays, rcond=1e-6)[0]
+        return float(np.sqrt(np.mean(rays**2)))
+
+
+def _without_smooth(image: F32) -> F64:
+    """Differences from the surroundings: air that is not zero and matter beyond the field are smooth."""
+    return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
+
+
+def better(one: F64, other: F64) -> bool:
+    """The first deviations [view] are surely less than the second, by the scatter from view to view."""
+    share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
+    return bool(share.mean() > _LEAST) and beyond_chance(share, _SURE)
+
+
+COLS, ROWS = 320, 96  # Pixels that show the geometry; more cost time
+LEAST_VIEWS = 12
+_FEWEST = 20  # columns of the coarsest pixels
+_AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
+_STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
+_ROUNDS = 16  # of conjugate gradients in each
+_FARTHEST = 2.0  # binned pixels that anything moves in a step
+_NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller changes are dropped
+
+
+@dataclass(frozen=True, eq=False)
+class LearntGeometry:
+    """What was learnt of a geometry.
+
+    Attributes:
+        change: in pixels of the views; what was not confirmed is zero.
+        confirmed, dropped: names of terms.
+        before, after: median deviation of views held out, by volumes of the others.
+    """
+
+    change: GeometryChange
+    confirmed: tuple[str, ...]
+    dropped: tuple[str, ...]
+    before: float
+    after: float
+
+    def in_words(self, binning: int = 1) -> str:
+        """In a sentence, in pixels smaller by `binning`."""
+        told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        if not (self.confirmed or self.dropped):
+            return "Geometry: the views show no error of it that matters; it is left as it was."
+        kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
+        if not told:
+            return f"Geometry: {kept}"
+        first = f"Geometry learnt: {told}. Views held out deviate by {self.after:.4g} in place of {self.before:.4g}."
+        return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
+
+    def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
+        """For the file of a volume, by name; pixels smaller by `binning`."""
+        return {
+            "calibrate_confirmed": ",".join(self.confirmed) or "none",
+            "calibrate_axis_change_px": self.change.axis * binning,
+            "calibrate_roll_deg": math.degrees(self.change.roll),
+            "calibrate_tilt_deg": math.degrees(self.change.tilt),
+            "calibrate_held_out_before": self.before,
+            "calibrate_held_out_after": self.after,
+        }
+
+
+def learn_geometry(
+    projections: F32,
+    geometry: Geometry,
+    terms: frozenset[str],
+    progress: Callable[[int, int], None] = lambda n, total: None,
+    known: F32 | None = None,
+) -> LearntGeometry:
+    """The geometry by which a volume explains the views best, as far as views held out confirm it.
+
+    Args:
+        projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
+        terms: what may change, of `freedom.TERMS`.
+        progress: steps done, and steps at most.
+        known: [row, col] weights of pixels; None: one for all.
+
+    Raises:
+        ValueError: fewer than twelve views, or views without matter.
+    """
+    if geometry.n_views < LEAST_VIEWS:
+        raise ValueError(f"{geometry.n_views} views are too few; {LEAST_VIEWS} are needed")
+    if not projections.any():
+        raise ValueError("the views show no matter")
+    factors = _factors(*geometry.detector_shape)
+    steps = _STEPS[: len(factors)]
+    total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    learnt = geometry
+    for factor, count in zip(factors, steps, strict=True):
+        small, data = learnt.binned(factor), bin_views(projections, factor)
+        fit = JointFit.of(data, small, frozenset({"axis"}), _weights(known, factor, data))
+        fit.step(_AXIS_ROUNDS, 0.0)
+        if factor == factors[0] and "axis" in terms:
+            for _ in range(_AXIS_STEPS):
+                fit.step(_AXIS_ROUNDS, _FARTHEST)
+                tick()
+        fit.terms = terms
+        for _ in range(count):
+            fit.step(_ROUNDS, _FARTHEST)
+            tick()
+        learnt = GeometryChange.between(small, fit.geometry).scaled(factor).applied(learnt)
+    return _confirmed(
+        projections, geometry, GeometryChange.between(geometry, learnt).of(terms), known, factors[-1], tick
+    )
+
+
+def _factors(rows: int, cols: int) -> list[int]:
+    """Binning of the levels, from coarse to fine."""
+    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1  # a pixel is not needed for a hundredth of it
+    factors = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
+    return factors[-len(_STEPS) :] or [1]
+
+
+def _weights(known: F32 | None, factor: int, data: F32) -> F32 | None:
+    if known is None:
+        return None
+    return np.ascontiguousarray(np.broadcast_to(bin_views(known[None], factor), data.shape))
+
+
+def _confirmed(
+    projections: F32,
+    geometry: Geometry,
+    change: GeometryChange,
+    known: F32 | None,
+    factor: int,
+    tick: Callable[[], None],
+) -> LearntGeometry:
+    """The part of a change that views held out confirm: the whole against none, then each term of it."""
+    small, data = geometry.binned(factor), bin_views(projections, factor)
+    edge = edge_motion(geometry)
+    sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
+    wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
+    judge = Judge(
+        data,
+        taller(Grid.matching(small)),
+        None if known is None else bin_views(known[None], factor)[0],
+        "shifts" in wanted,
+    )
+
+    def judged(terms: list[str]) -> NDArray[np.float64]:
+        tick()
+        return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
+
+    before = judged([])
+    # Shifts and axis are one: the axis is their mean.
+    places = [term for term in wanted if term in ("axis", "shifts")]
+    groups = [each for each in (places, *([term] for term in wanted if term not in places)) if each]
+    kept, after = list(wanted), judged(wanted) if wanted else before
+    if not better(after, before):
+        kept, after = [], before
+        for group in groups if len(groups) > 1 else []:
+            alone = judged(group)
+            if better(alone, after):
+                kept, after = group, alone
+    elif len(groups) > 1:
+        for group in groups:
+            rest = [term for term in kept if term not in group]
+            without = judged(rest)
+            if not better(after, without):
+                kept, after = rest, without
+    asked = [term for term in wanted if term not in kept]
+    return LearntGeometry(
+        change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
+    )
+
+
+def _text(change: GeometryChange, term: str, binning: int) -> str:
+    if term == "axis":
+        return f"the axis moves by {change.axis * binning:+.2f} px"
+    if term == "shifts":
+        return f"views by up to {np.abs(change.shifts).max() * binning:.2f} px"
+    return f"{term} {math.degrees(getattr(change, term)):+.3f}°"

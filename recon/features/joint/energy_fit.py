@@ -1,0 +1,271 @@
+"""Steps of the one fit of `spectral` and `series`. Each view sees a sum of volumes with its own shares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.settings_check import check_settings
+from recon.base.volume import Grid
+from recon.features.joint.motion import Motion, moved, moved_back, weighed
+from recon.kernels.cpu.mixtures import nonnegative_mix
+from recon.kernels.cpu.vectors import combine
+from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
+
+_SUBSETS, _TV_STEPS = 9, 3
+_ROUNDS = 6  # of power iteration
+_LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
+_NOTHING = 1e-20  # singular value of materials that attenuate nothing
+
+
+def refuse_alike(cross_sections: F64) -> None:
+    """Raises ValueError where cross sections [energy, material] are not finite, or do not tell the materials apart."""
+    n, materials = cross_sections.shape
+    if not np.isfinite(cross_sections).all():
+        raise ValueError("cross_sections must be finite")
+    values = np.linalg.svd(cross_sections, compute_uv=False)
+    if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
+        raise ValueError(
+            f"views of {n} energies do not tell {materials} materials apart: give more energies, or fewer materials"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyViews:
+    """Views of one sample, each of a mixture of volumes: at its energy, of what materials attenuate there.
+
+    A series in time is the same: each moment counts as an energy, each volume as a material.
+
+    Attributes:
+        projections: line integrals, float32 [view, row, col], finite.
+        geometry: of all views.
+        energy: [view], index of the energy of each view.
+        cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
+        weight: of each ray [view, row, col]; None: one.
+
+    Raises:
+        ValueError: shapes or indices do not fit, values are not finite, or the energies do not tell materials apart.
+    """
+
+    projections: F32
+    geometry: Geometry
+    energy: NDArray[np.intp]
+    cross_sections: F64
+    weight: F32 | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        wanted = (self.geometry.n_views, *self.geometry.detector_shape)
+        for name, array in (("projections", self.projections), ("weight", self.weight)):
+            if array is not None and array.shape != wanted:
+                raise ValueError(f"{name} must have the geometry's shape {wanted}, got {array.shape}")
+        if not np.isfinite(self.projections).all():
+            raise ValueError("projections must be finite: give rays that were not measured the weight 0 and any value")
+        if self.cross_sections.ndim != 2:
+            raise ValueError(f"cross_sections must be [energy, material], got shape {self.cross_sections.shape}")
+        n = len(self.cross_sections)
+        if self.energy.shape != wanted[:1] or self.energy.min() < 0 or self.energy.max() >= n:
+            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {wanted[0]} views")
+        refuse_alike(self.cross_sections[np.unique(self.energy)])
+
+    def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
+        """Some views, and neighbouring rows of them."""
+        first, stop, _ = rows.indices(self.projections.shape[1])
+        weight = None if self.weight is None else self.weight[views, rows]
+        geometry = self.geometry.select(views).rows(first, stop)
+        return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
+
+    def parted(self, n: int) -> NDArray[np.intp]:
+        """The part 0 ... n - 1 of each view: each part sees all energies, and directions all around.
+
+        Of more energies than a part has views, neighbours count as one.
+        """
+        views, energies = self.geometry.n_views, len(self.cross_sections)
+        groups = min(energies, max(n, views // n))
+        part, group = np.empty(views, np.intp), self.energy * groups // energies
+        angles = np.mod(self.geometry.angles, self.geometry.period)
+        for number in range(groups):
+            own = np.flatnonzero(group == number)
+            part[own[np.argsort(angles[own], kind="stable")]] = (number * n // groups + np.arange(own.size)) % n
+        return part
+
+
+class _StoppedError(Exception):
+    """`stop` interrupted a step."""
+
+
+class _Part(NamedTuple):
+    """Views of one energy in one subset: data and weight as lines [view, col, row]."""
+
+    energy: int
+    projector: Projector
+    data: F32
+    weight: F32 | None
+
+
+@dataclass(eq=False)
+class EnergyFit:
+    """The volumes of `fit_materials`, and its steps.
+
+    Attributes:
+        motion: of the volume at each energy; None: it does not move.
+        z: float32 [component, y, x, z].
+        subsets: of the views; each has all energies.
+        _to, _back: from densities to components, and back.
+        _u: U [energy, component].
+        step: 1 / L. L bounds the curvature of a subset: the largest eigenvalue of AᵀWA where a view of energy e weighs
+            |U[e]|². That is a bound since A has no negative entry, so |A Σ U z| <= |U| A |z|.
+    """
+
+    views: EnergyViews
+    grid: Grid
+    rng: np.random.Generator
+    motion: Motion | None = None
+    stop: Callable[[], bool] = lambda: False
+    z: F32 = field(init=False)
+    subsets: list[list[_Part]] = field(init=False)
+    step: float = field(init=False)
+    _begun: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        views = self.views
+        counts = np.bincount(views.energy, minlength=len(views.cross_sections))
+        seen = np.sqrt(counts / counts.max())[:, None]
+        u, values, mix = np.linalg.svd(seen * views.cross_sections, full_matrices=False)
+        self._to = values[:, None] * mix
+        self._back = mix.T / values
+        self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
+        whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
+        weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
+        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # views of nothing leave nothing
+        subset = views.parted(subsets_of(views.geometry, _SUBSETS))
+        self.subsets = []
+        for number in range(subset.max() + 1):
+            own = [np.flatnonzero((subset == number) & (views.energy == e)) for e in range(counts.size)]
+            self.subsets.append(
+                [
+                    _Part(e, whole.subset(at), data[at], None if views.weight is None else weight[at])
+                    for e, at in enumerate(own)
+                    if at.size
+                ]
+            )
+        nz, ny, nx = self.grid.shape
+        self.z = np.zeros((values.size, ny, nx, nz), np.float32)
+        if self.motion is not None:
+            self.move(self.motion)
+            return
+        largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
+        heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
+        self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
+
+    def move(self, motion: Motion) -> None:
+        """Let the volume move so from here on."""
+        self.motion = motion
+        self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
+
+    def _curvature(self, subset: list[_Part]) -> float:
+        """As `largest_eigenvalue`, of a volume that moves."""
+        x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
+        for _ in range(_ROUNDS):
+            product = np.zeros_like(x)
+            for part in subset:
+                u = None if self.motion is None else self.motion.at(part.energy)
+                lines = part.projector.forward_lines(moved(x, u))
+                lines *= np.float32((self._u[part.energy] ** 2).sum())
+                product += moved_back(part.projector.adjoint_lines(weighed(lines, part.weight)), u)
+            bound = min(bound, float(np.divide(product, x, out=np.zeros_like(x), where=x > 0).max()))
+            x = product / product.max()
+        return bound
+
+    def image(self, energy: int) -> F32:
+        """The volume [y, x, z] at an energy, before it moves."""
+        return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
+
+    def descent(self, subset: list[_Part], out: F32) -> float:
+        """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares.
+
+        Raises:
+            _StoppedError: `stop` said so.
+        """
+        out[...] = 0
+        squares, image = 0.0, np.empty(self.z.shape[1:], np.float32)
+        for part in subset:
+            if self._begun and self.stop():
+                raise _StoppedError
+            image[...] = 0
+            for share, component in zip(self._u[part.energy], self.z, strict=True):
+                combine(1.0, image, float(share), component, image)
+            u = None if self.motion is None else self.motion.at(part.energy)
+            residual = part.data - part.projector.forward_lines(moved(image, u))
+            weighted = weighed(residual, part.weight)
+            squares += float(np.vdot(residual, weighted))
+            back = moved_back(part.projector.adjoint_lines(weighted, image), u)
+            for share, component in zip(self._u[part.energy], out, strict=True):
+                combine(1.0, component, float(share), back, component)
+        return squares
+
+    def sweeps(self, weights: F64, n: int) -> Iterator[float]:
+        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. After a
+        stop z is that before the step that it interrupts."""
+        _, ny, nx, nz = self.z.shape
+        differences, count = difference_weights(self.grid), len(self.subsets)
+        prox = [TotalVariationProx((ny, nx, nz), differences, False, _TV_STEPS) for _ in self.z]
+        ahead, descent = Momentum(self.z, Decisions()), np.empty_like(self.z)
+        for sweep in range(n):
+            squares = 0.0
+            order = [number for _ in range(_SUBSETS // count) for number in self.rng.permutation(count)]
+            for at, number in enumerate(order):
+                try:
+                    squares += self.descent(self.subsets[number], descent)
+                except _StoppedError:
+                    nonnegative_mix(self.z, self._back, self._to)  # momentum may have gone below 0
+                    return
+                self._begun = True
+                combine(1.0, self.z, self.step, descent, self.z)
+                for component, near, weight in zip(self.z, prox, weights, strict=True):
+                    near(component, float(weight) * self.step / count)
+                    near.turn()
+                nonnegative_mix(self.z, self._back, self._to)
+                if at + 1 < len(order):
+                    ahead(self.z)
+            yield math.sqrt(squares * count / len(order)) / self._norm
+            if sweep + 1 < n:
+                ahead(self.z)
+
+    def residual_of(self, densities: F32) -> float:
+        """What densities [material, z, y, x] leave of all views, over the norm of the views."""
+        self.z = np.ascontiguousarray(np.einsum("km,mzyx->kyxz", self._to.astype(np.float32), densities))
+        out = np.empty_like(self.z)
+        return math.sqrt(sum(self.descent(subset, out) for subset in self.subsets)) / self._norm
+
+    def steepest(self) -> float:
+        """The largest entry of the gradient at z."""
+        out, total = np.empty_like(self.z), np.zeros_like(self.z)
+        for subset in self.subsets:
+            self.descent(subset, out)
+            total += out
+        return float(np.abs(total).max())
+
+    def densities(self) -> F32:
+        """[material, z, y, x]."""
+        return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
+
+
+def fitted(fit: EnergyFit, weights: F64, sweeps: int, go_on: Callable[[int, float], bool]) -> tuple[F32, float]:
+    """Densities and residual after so many sweeps, or when `go_on` ends them."""
+    residual = 1.0
+    for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
+        if not go_on(sweep, residual):
+            break
+    return fit.densities(), residual

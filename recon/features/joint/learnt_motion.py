@@ -1,0 +1,170 @@
+"""The motion of a sample while it is scanned, learnt from coarse to fine voxels.
+
+One volume, displaced, explains all views of a sample that only moves. So volume and motion improve each other in turns,
+first on voxels so coarse that the motion is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from recon.base.arrays import F32, F64
+from recon.base.volume import Grid
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews
+from recon.features.joint.motion import Motion, Seen, improved, moved, weighed
+from recon.voxels.projector import Projector, projection_lines, volume_lines
+
+_COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
+_FINE = 96  # pixels across up to which the last level has a voxel a pixel; of more, one for two
+_TURNS = 6, 4, 2  # of the first levels; later ones have the last number
+SWEEPS_OF_TURN = 6  # of a turn, which go on from the last one
+_KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
+_HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
+JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
+_BLOCKS, _ONE_BLOCK_IN = 32, 4  # of the scan's time, and one of so many held out: eight
+
+
+def levels(cols: int) -> list[tuple[int, int]]:
+    """Pixels in a voxel, and turns, of each level for so many pixels across."""
+    last = 1 if cols <= _FINE else 2
+    widths = [last]
+    while cols // (2 * widths[0]) >= _COARSEST:
+        widths.insert(0, 2 * widths[0])
+    return [(width, _TURNS[min(n, len(_TURNS) - 1)]) for n, width in enumerate(widths)]
+
+
+def motion_sweeps(cols: int) -> int:
+    """Of `learnt_motion`."""
+    return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
+
+
+class OfMoments(NamedTuple):
+    """Views of a sample that changes, as of some moments.
+
+    Attributes:
+        views: each `energy` is a moment, each material a knot of the densities.
+        times: [moment] within the scan, 0 ... 1.
+        weights: of total variation of the densities' components.
+    """
+
+    views: EnergyViews
+    times: F64
+    weights: F64
+
+
+def unseen_squares(
+    coarse: OfMoments, fine: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> F64 | None:
+    """What volumes that do not move, and volumes that do, leave of views held out: squares [2, block], over the mean
+    of the views' own; None: stopped.
+
+    Views that follow each other are held out in blocks. Where angles rise with time, volumes in time predict a single
+    view from those before and after it, even of a sample that moves. The motion is learnt from `coarse` moments of the
+    other views; volumes of coarse voxels are fitted to `fine` ones, within which the sample hardly moves.
+
+    Args:
+        coarse, fine: the same views.
+        go_on, stop: as of `learnt_motion`.
+    """
+    block = fine.views.energy * _BLOCKS // len(fine.views.cross_sections)
+    held_out = block % _ONE_BLOCK_IN == _ONE_BLOCK_IN // 2
+    used, follow = np.flatnonzero(~held_out), 2 * JUDGED_SWEEPS
+    seen = coarse._replace(views=coarse.views.select(used, slice(None)))
+    motion = learnt_motion(seen, lambda sweep, residual: go_on(sweep - follow, residual), stop)
+    if motion is None:
+        return None
+    views = _binned(fine.views, round(fine.views.geometry.detector_shape[1] / JUDGED))
+    grid, left = Grid.matching(views.geometry), []
+    nz, ny, nx = grid.shape
+    for now in (None, motion.on((ny, nx, nz), fine.times)):
+        fit = EnergyFit(views.select(used, slice(None)), grid, np.random.default_rng(0), now, stop)
+        for residual in fit.sweeps(fine.weights, JUDGED_SWEEPS):
+            follow -= 1
+            if not go_on(-follow, residual):
+                return None
+        if stop():
+            return None
+        left.append(_squares_left(views, fit.densities(), now, grid))
+    numbers = np.unique(block[held_out])
+    of_blocks = np.array([[squares[block == number].sum() for number in numbers] for squares in left])
+    own = _squares_left(views, np.zeros_like(fit.densities()), None, grid)[held_out].sum() / numbers.size
+    return of_blocks / (own or 1.0)
+
+
+def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
+    """[view] weighed squares of what densities [knot, z, y, x] leave."""
+    projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
+    weight = None if views.weight is None else projection_lines(views.weight)
+    squares = np.empty(len(data))
+    for view, moment in enumerate(views.energy.tolist()):
+        now = volume_lines(np.tensordot(views.cross_sections[moment].astype(np.float32), densities, 1))
+        image = projector.subset([view]).forward_lines(moved(now, None if motion is None else motion.at(moment)))
+        off = data[view : view + 1] - image
+        squares[view] = np.vdot(off, weighed(off, None if weight is None else weight[view : view + 1]))
+    return squares
+
+
+def learnt_motion(
+    of_moments: OfMoments, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> Motion | None:
+    """The motion on the voxels of `Grid.matching`; None: stopped.
+
+    Args:
+        go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
+        stop: asked many times within a sweep; True ends it.
+    """
+    views, times, weights = of_moments
+    cols = views.geometry.detector_shape[1]
+    alone = replace(views, cross_sections=np.ones((times.size, 1)))
+    motion, follow = None, motion_sweeps(cols)
+    for wide, turns in levels(cols):
+        some = _binned(alone, wide)
+        grid = Grid.matching(some.geometry)
+        nz, ny, nx = grid.shape
+        motion = (
+            Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
+        )
+        fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion, stop), _seen(some, grid)
+        for _ in range(turns):
+            for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), SWEEPS_OF_TURN):
+                follow -= 1
+                if not go_on(-follow, residual):
+                    return None
+            if stop():
+                return None
+            motion = improved(motion, seen, fit.image)
+            fit.move(motion)
+    assert motion is not None
+    nz, ny, nx = Grid.matching(views.geometry).shape
+    return motion.on((ny, nx, nz), times)
+
+
+def _binned(views: EnergyViews, n: int) -> EnergyViews:
+    """Mean of n x n pixels; of their weights, too."""
+    n = max(1, min(n, *views.geometry.detector_shape))
+
+    def mean(images: F32) -> F32:
+        count, rows, cols = images.shape
+        part = images[:, : rows // n * n, : cols // n * n].reshape(count, rows // n, n, cols // n, n)
+        return np.asarray(part.mean((2, 4), dtype=np.float32), np.float32)
+
+    geometry = views.geometry.binned(n)
+    if views.weight is None:
+        return replace(views, projections=mean(views.projections), geometry=geometry)
+    weight = mean(views.weight)
+    data = np.divide(mean(views.projections * views.weight), np.maximum(weight, np.float32(1e-6)), dtype=np.float32)
+    return replace(views, projections=data, geometry=geometry, weight=weight)
+
+
+def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
+    whole, data = Projector(views.geometry, grid), projection_lines(views.projections)
+    weight = None if views.weight is None else projection_lines(views.weight)
+    return [
+        Seen(int(e), whole.subset(at), data[at], None if weight is None else weight[at])
+        for e in np.unique(views.energy)
+        for at in [np.flatnonzero(views.energy == e)]
+    ]

@@ -1,0 +1,278 @@
+"""Methods of several volumes that all views determine together: at times of a scan, or of each material."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.settings_check import check_settings
+from recon.base.volume import Grid, Volume, VolumeSeries
+from recon.base.work import Costs, Work
+from recon.features.joint.energy_fit import EnergyViews
+from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS
+from recon.features.joint.series import SWEEPS, TimedViews, fit_series, series_costs
+from recon.features.joint.share_fit import STEPS, fit_share
+from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
+
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
+_OF_SHARE = 10  # volumes in memory while a share is fitted, beside those of the result
+_COPIES = 6  # of all line integrals: lines, a part held out, moments, binned views, weights, and their copy
+
+
+@dataclass(frozen=True)
+class TimeSeries:
+    """Volumes at even times of one scan of a sample that changes, see `fit_series`.
+
+    Attributes:
+        volumes: 2 or more, from the first view to the last; each needs twelve views or more.
+        moves: matter moves, and not only its density changes; None: what views held out prefer.
+        sweeps: of the fit.
+        weight: of total variation, `tv_weight` of `fit_series`; None: what views held out prefer.
+
+    Raises:
+        ValueError: other values.
+    """
+
+    name: ClassVar[str] = "series"
+    label: ClassVar[str] = "Volumes in time"
+    traits: ClassVar[Traits] = Traits(in_time=True)
+
+    volumes: int = 2
+    moves: bool | None = None
+    sweeps: int = SWEEPS
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self, whole={"volumes": 2, "sweeps": 1}, least={"weight": 0.0})
+
+    @property
+    def volume_names(self) -> tuple[str, ...]:
+        return ()
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        _require_own_grid(problem)
+        n, times = problem.geometry.n_views, problem.use.times
+        times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
+        history = _History(self.sweeps, n, control)
+        data, weights = _measured(problem)
+        made = fit_series(
+            TimedViews(data, problem.geometry, times, weights),
+            self.volumes,
+            motion=self.moves,
+            tv_weight=self.weight,
+            sweeps=self.sweeps,
+            seed=problem.seed,
+            go_on=history.heard,
+            stop=control.stop,
+        )
+        series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
+        settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
+        settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
+        if made.unseen_residuals is not None:
+            settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
+        return history.result(series, made.grid, settings, made.at)
+
+    def toy(self) -> Self:
+        return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        return series_costs(geometry, self.volumes, self.moves, self.sweeps)
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        return (_VOLUMES * self.volumes + _FIELDS) * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+
+
+@dataclass(frozen=True)
+class EnergySeries:
+    """A volume of each material, from views of one sample at several energies, see `fit_materials`.
+
+    Attributes:
+        materials: their names, one for each column of `Energies.cross_sections`.
+        states: names of two of them that are two states of the same one, so that the share of the second is smooth
+            within matter, see `fit_share`; empty: no such pair.
+        sweeps: of the fit.
+        weight: of total variation, `tv_weight` of `fit_materials`; None: what views held out prefer.
+
+    Raises:
+        ValueError: other values.
+    """
+
+    name: ClassVar[str] = "materials"
+    label: ClassVar[str] = "Materials"
+    traits: ClassVar[Traits] = Traits(by_energy=True)
+
+    materials: tuple[str, ...] = ("matter",)
+    states: tuple[str, ...] = ()
+    sweeps: int = MATERIAL_SWEEPS
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        check_settings(self, whole={"sweeps": 1}, least={"weight": 0.0})
+        object.__setattr__(self, "materials", tuple(self.materials))
+        object.__setattr__(self, "states", tuple(self.states))
+        if not self.materials or len(set(self.materials)) < len(self.materials):
+            raise ValueError(
+                f"materials must be distinct names, at least one, got {', '.join(self.materials) or 'none'}"
+            )
+        two = len(self.states) == 2 and len(set(self.states) & set(self.materials)) == 2
+        if self.states and not two:
+            raise ValueError(
+                f"states are {','.join(self.states)}: expected two of the materials {', '.join(self.materials)}"
+            )
+
+    @property
+    def volumes(self) -> int:
+        return len(self.materials)
+
+    @property
+    def volume_names(self) -> tuple[str, ...]:
+        return self.materials
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        _require_own_grid(problem)
+        n = problem.geometry.n_views
+        energies = problem.use.energies or Energies(np.zeros(n, np.intp), np.ones((1, 1)))
+        if not (energies.cross_sections >= 0).all():
+            raise ValueError(f"cross sections must be 0 or more, got {energies.cross_sections.min():g}")
+        if energies.cross_sections.shape[1:] != (self.volumes,):
+            raise ValueError(
+                f"cross_sections have shape {energies.cross_sections.shape}; expected a column for each of "
+                f"{', '.join(self.materials)}"
+            )
+        data, weights = _measured(problem)
+        views = EnergyViews(data, problem.geometry, energies.of_view, energies.cross_sections, weights)
+        history = _History(self.sweeps, n, control)
+        made = fit_materials(
+            views,
+            problem.grid,
+            tv_weight=self.weight,
+            sweeps=self.sweeps,
+            seed=problem.seed,
+            go_on=history.heard,
+            stop=control.stop,
+        )
+        settings: dict[str, Any] = {"materials": ",".join(self.materials), "sweeps": self.sweeps}
+        settings |= {"weights": made.weights}
+        if self.states and not control.stop():
+            first, second = (self.materials.index(state) for state in self.states)
+            free = made
+            made = fit_share(views, free, (first, second), history.heard_share, control.stop)
+            settings |= {"states": ",".join(self.states)} if made is not free else {}
+        series = VolumeSeries(np.empty(0), made.densities, made.residual, self.materials)
+
+        def at(energy: float) -> F32:
+            shares = energies.cross_sections[int(energy)].astype(np.float32)
+            volume: F32 = np.tensordot(shares, series.data, 1)
+            return volume
+
+        return history.result(series, made.grid, settings, at)
+
+    def toy(self) -> Self:
+        return replace(self, materials=("matter",), states=(), sweeps=1)
+
+    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
+        few = min(grid.shape[0], TRIAL_ROWS) / grid.shape[0] if geometry.rows_show_slices else 1.0
+
+        def swept(sweeps: float, share: float = 1.0) -> Work:
+            views = sweeps * geometry.n_views
+            return Work.of(f"series, energies {self.volumes}", views, views * share * math.prod(grid.shape))
+
+        # A step of the share takes about as long as a sweep.
+        share = swept(SOLUTION_STEPS) + swept(TRIAL_STEPS, few) if self.states else Work()
+        return Costs({self.name: swept(self.sweeps) + share}, swept(TRIAL_SWEEPS, few))
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        volumes = max(_VOLUMES * self.volumes, self.volumes + _OF_SHARE if self.states else 0)
+        return volumes * 4 * math.prod(grid.shape) + _COPIES * _bytes_of(geometry)
+
+
+@dataclass
+class _History:
+    """Progress of a fit: sweeps of trials, which count down to 0 each time, and those of the fit, which are kept."""
+
+    sweeps: int
+    n_views: int
+    control: RunControl
+    of_sweeps: tuple[Progress, ...] = ()
+    tried: int = 0
+
+    def __post_init__(self) -> None:
+        self.began = self.control.now()
+
+    def heard(self, sweep: int, residual: float) -> bool:
+        """As `fit_series` and `fit_materials` call their `go_on`."""
+        if sweep > 0:
+            self.tell(sweep, residual)
+        else:
+            self.tried += 1
+            self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
+            self.tried = 0 if sweep == 0 else self.tried
+        return not self.control.stop()
+
+    def heard_share(self, steps_to_come: int) -> bool:
+        """As `fit_share` calls its `go_on`."""
+        self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
+        return not self.control.stop()
+
+    def tell(self, sweep: int, residual: float) -> None:
+        """Of a sweep of the fit."""
+        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
+
+    def _tell(self, reached: Progress) -> Progress:
+        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
+        if self.control.on_progress is not None:
+            self.control.on_progress(now)
+        return now
+
+    def result(
+        self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
+    ) -> Reconstruction:
+        """The volumes with this history."""
+        if not self.of_sweeps:  # it was stopped before
+            self.tell(0, series.residual)
+        return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
+
+
+def _progress(n: int, of: int, unit: str) -> Progress:
+    return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
+
+
+def _require_own_grid(problem: ReconProblem) -> None:
+    if problem.grid != Grid.matching(problem.geometry):
+        raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
+
+
+def _bytes_of(geometry: Geometry) -> int:
+    """Of all line integrals."""
+    return 4 * geometry.n_views * math.prod(geometry.detector_shape)
+
+
+def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
+    """Line integrals [view, row, col], 0 and without weight where nothing was measured; and the weights, of one shape.
+
+    Raises:
+        ValueError: no line integral that was measured is above 0.
+    """
+    data, weights = problem.projections, problem.use.weights
+    if not (finite := np.isfinite(data)).all():
+        weights = finite.astype(np.float32) if weights is None else weights * finite
+    if weights is not None:
+        data = np.where(weights > 0, data, np.float32(0))
+    if not data.max() > 0:
+        raise ValueError("no line integral that is finite and has a weight is above 0: these views hold no matter")
+    return data, weights
+
+
+def _because(still: float, moved: float, moves: bool) -> str:
+    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    if moves or moved >= still:
+        return f"{'motion' if moves else 'no motion'}, as {judged}"
+    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"

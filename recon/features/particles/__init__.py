@@ -1,0 +1,1 @@
+"""Particles of a segmented volume: parted at their necks, and measured."""

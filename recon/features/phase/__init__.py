@@ -1,0 +1,1 @@
+"""Phase: contrast from the bright rims of a propagated wave."""

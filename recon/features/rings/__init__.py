@@ -1,0 +1,1 @@
+"""Rings: stripes that unequal pixels make in sinograms, seen and removed."""

@@ -1,0 +1,333 @@
+"""Rings: removes the stripes that pixels with unequal response make in a sinogram; in a slice they are rings.
+
+A sinogram is float32 [view, col] of one detector row, line integrals in the order of their angles, where a stripe is a
+column. Stripes of views that cover little angle cannot be told from the sample's own edges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
+
+from recon.base.arrays import F32, median_deviation
+from recon.base.choices import Rings
+from recon.base.declared_types import check_arguments
+from recon.base.noise import without_layers
+from recon.base.units import warn_of_other_quantity
+from recon.post.steadiness import AT_AXIS, NARROWEST, steadiness
+
+_ROBUST = 1.4826  # as 1 / MEDIAN, rounded: volumes that were recorded have it in what `by_sorting` takes off
+_FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
+_FEWEST_VIEWS = 8
+_MOST = 0.1  # of the columns
+_EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
+_ROWS = 8  # looked at
+_COPIES = 13  # float32 copies of a sinogram
+_LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
+
+# Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).
+_DB5 = np.array(
+    [0.160102397974125, 0.603829269797473, 0.724308528438574, 0.138428145901103, -0.242294887066190,
+     -0.032244869585030, 0.077571493840065, -0.006241490213012, -0.012580751999016, 0.003335725285002]
+)  # fmt: skip
+
+
+def width_for(cols: int) -> int:
+    """Odd number of columns for a median: wider than small stripes and narrower than the sample. 31 for 2048, 7 for
+    160, 3 for 40."""
+    return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
+
+
+def by_sorting(sinogram: F32, width: int | None = None) -> F32:
+    """Remove small and medium stripes by a median across columns, after sorting the values of each column.
+
+    A stripe shifts all values of its column. Sorted, neighbouring columns look alike, so that the difference is the
+    stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: a stripe adds about the same
+    to all views, and only that is removed; otherwise edges of metal leave black streaks across the slice]
+    """
+    order = np.argsort(sinogram, axis=0, kind="stable")
+    ranked = np.take_along_axis(sinogram, order, axis=0)
+    smooth = median_filter(ranked, (1, width or width_for(sinogram.shape[1])), mode="nearest")
+    out = np.empty_like(sinogram)
+    np.put_along_axis(out, order, smooth, axis=0)
+    taken = sinogram - out
+    usual, most = np.median(taken, axis=0), np.float32(_FAR * _noise(sinogram))
+    return np.asarray(sinogram - np.clip(taken, usual - most, usual + most), np.float32)
+
+
+def without_dead_columns(sinogram: F32) -> F32:
+    """Fill columns that hardly respond, or flicker, from their neighbours (Vo et al. 2018, algorithm 6).
+
+    Such a column varies more or less from view to view than the median of the columns around. [our own: by the median
+    of the views, because edges of metal cross a column in a few views]
+    """
+    rough = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
+    bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
+    return _filled(sinogram, bad)
+
+
+def without_large_stripes(sinogram: F32) -> F32:
+    """Shift wide or strong stripes to the level of their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
+
+    A column is changed only if its sorted values differ from those around by three times the noise of a pixel. They
+    must do so over their middle four fifths, by about as much everywhere. If a tenth of all columns do, no column is
+    changed. [our own: the second condition; without it metal near the axis counts as a stripe]
+    """
+    ranked = np.sort(sinogram, axis=0)
+    smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
+    drop = len(ranked) // 10
+    off = (ranked - smooth)[drop : len(ranked) - drop]
+    shift = off.mean(axis=0)
+    far = np.abs(shift) > _FAR * max(_noise(sinogram), median_deviation(shift))
+    far &= off.std(axis=0) < _EVEN * np.abs(shift)
+    if far.mean() > _MOST:
+        return sinogram  # so many columns belong to the sample
+    return sinogram - np.where(far, shift, 0).astype(np.float32)
+
+
+def by_vo(sinogram: F32) -> F32:
+    """Remove dead columns, then large stripes, then small ones (Vo et al. 2018, section 3.7)."""
+    return by_sorting(without_large_stripes(without_dead_columns(sinogram)))
+
+
+def by_wavelets(sinogram: F32, levels: int = _LEVELS, damping: float = _DAMPING) -> F32:
+    """Remove stripes from the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express
+    17, 8567).
+
+    Coefficients that are smooth along the views and rough along the columns hold the stripes. There, frequencies k
+    along the views are damped by 1 - exp(-k² / (2 damping²)).
+    """
+    views, cols = sinogram.shape
+    step = 2**levels
+    pad = [(step * 2, step * 2 + -n % step) for n in (views, cols)]
+    smooth = np.pad(sinogram.astype(np.float64), pad, mode="symmetric")
+    details = []
+    for _ in range(levels):
+        low, high = _analysed(smooth, 1)
+        smooth, along = _analysed(low, 0)
+        stripes, corner = _analysed(high, 0)
+        spectrum = np.fft.rfft(stripes, axis=0)
+        k = np.arange(len(spectrum))[:, None]
+        stripes = np.fft.irfft(spectrum * (1 - np.exp(-(k**2) / (2 * damping**2))), len(stripes), axis=0)
+        details.append((along, stripes, corner))
+    for along, stripes, corner in reversed(details):
+        smooth = _synthesised(_synthesised(smooth, along, 0), _synthesised(stripes, corner, 0), 1)
+    return smooth[pad[0][0] : pad[0][0] + views, pad[1][0] : pad[1][0] + cols].astype(np.float32)
+
+
+REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType(
+    {"sort": by_sorting, "vo": by_vo, "wavelet": by_wavelets}
+)
+"""Ways to remove stripes, by name."""
+_NAMES: Mapping[Callable[[F32], F32], str] = {
+    by_sorting: "sort",
+    without_dead_columns: "dead columns",
+    without_large_stripes: "large stripes",
+}
+
+
+def stripe_score(sinogram: F32) -> float:
+    """Typical difference of a column from the four beside it, over its own noise; about 1 without stripes.
+
+    It is a median over views, without edges of the sample, which cross a column in a few views. A body on the axis
+    stays in its columns, and counts as a stripe.
+    """
+    x = sinogram
+    off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
+    noise = _noise(off)
+    of_columns = np.median(off, axis=0)
+    rough = np.diff(of_columns, 2) / math.sqrt(6)  # a large body bends slowly from column to column
+    spread = _ROBUST * np.median(np.abs(rough))
+    return float(spread / max(noise * math.sqrt(math.pi / 2 / len(x)), 1e-12))
+
+
+@dataclass(frozen=True, eq=False)
+class WithoutRings:
+    """Views without stripes.
+
+    Attributes:
+        data: float32 [view, row, col], line integrals.
+        taken: float32 [row, col], mean removed part of a view.
+        sentence: a sentence about the removal.
+    """
+
+    data: F32
+    taken: F32
+    sentence: str
+
+
+def remove_rings(
+    projections: ArrayLike,
+    angles: ArrayLike,
+    rings: Rings = "auto",
+    axis_col: float | None = None,
+) -> WithoutRings:
+    """A copy of line integrals without the stripes that make rings, for use between `recon.correct` and a method.
+
+    Args:
+        projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
+        angles: [view], radians.
+        rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
+            ones. "wavelet" by wavelets (Münch et al. 2009), "none". "auto" looks and chooses.
+        axis_col: column of the rotation axis; None: the middle.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are not finite, or another `rings`.
+    """
+    check_arguments(remove_rings, locals())
+    views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
+    if views.ndim != 3 or theta.shape != views.shape[:1]:
+        raise ValueError(f"projections {views.shape} must be [view, row, col] for angles {theta.shape}")
+    if not (np.isfinite(views).all() and np.isfinite(theta).all()):
+        raise ValueError("projections or angles hold NaN or infinite values; correct them first")
+    warn_of_other_quantity(views)
+    return WithoutRings(views, *remove_rings_in_place(views, theta, rings, axis_col))
+
+
+def remove_rings_in_place(
+    views: F32, angles: NDArray[np.float64], rings: Rings, axis_col: float | None = None
+) -> tuple[F32, str]:
+    """Stripes out of all rows of line integrals [view, row, col], in place.
+
+    Args:
+        views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
+        angles: [view], radians.
+        rings: the method. "auto" looks at some rows: it sorts where `steadiness` sees stripes, and takes out columns
+            that are dead or far off.
+        axis_col: column of the rotation axis; None: the middle. What a column has in common with the one on the other
+            side of the axis stays, see `without_layers`.
+
+    Returns:
+        float32 [row, col], mean removed part of a view, and a sentence about it; "" for "none".
+    """
+    taken = np.zeros(views.shape[1:], np.float32)
+    if rings == "none":
+        return taken, ""
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
+        return taken, (
+            f"Rings: {len(views)} views of {views.shape[2]} columns are too few to tell stripes from the sample (at "
+            f"least {_FEWEST_VIEWS} of {NARROWEST}); none removed."
+        )
+    order = np.argsort(angles, kind="stable")
+    axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
+    rows = _some_rows(views)
+    before = _typical_score(views[np.ix_(order, rows)])
+    stages = (REMOVERS[rings],) if rings != "auto" else _stages(views[np.ix_(order, rows)], axis)
+    if not stages:
+        return taken, "Rings: no stripes seen that are the detector's; none removed."
+    for row in range(views.shape[1]):
+        stripes = clean = views[order, row]
+        for remove in stages:
+            clean = remove(clean)
+        level = np.median(stripes - clean, axis=0)
+        clean = clean + (level - without_layers(level[None], axis)[0])
+        taken[row] = (stripes - clean).mean(axis=0)
+        views[order, row] = clean
+    after = _typical_score(views[np.ix_(order, rows)])
+    how = ", ".join(_NAMES.get(remove, rings) for remove in stages)
+    return taken, f"Rings: removed by {how}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+
+
+def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
+    """A sentence where pixels answer so unequally that rings are seen, with what removes them; otherwise ""."""
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
+        return ""
+    steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
+    if steady is None or not steady.stripes:
+        return ""
+    return (
+        f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "
+        "a column; nothing was removed. --rings auto (by a filter), or of a finished scan --calibrate gains (by the "
+        "volume), removes them; where the sample has layers around the axis, compare the volumes."
+    )
+
+
+def _some_rows(views: F32) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], _ROWS)).astype(np.intp))
+
+
+def _typical_score(sinograms: F32) -> float:
+    return float(np.median([stripe_score(sinograms[:, row]) for row in range(sinograms.shape[1])]))
+
+
+def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]:
+    """What removes the stripes of these rows [view, row, col] that are the detector's, in order."""
+    steady = steadiness(sinograms, axis_col)
+    strong = (without_dead_columns, without_large_stripes)
+    far_off = any(_far_off(sinograms[:, row], axis_col) for row in range(sinograms.shape[1]))
+    return (strong if far_off else ()) + ((by_sorting,) if steady is not None and steady.stripes else ())
+
+
+def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
+    """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
+    rows, cols = shape
+    looked_at = views * min(rows, _ROWS) * cols
+    if rings == "none" or views < _FEWEST_VIEWS or cols < NARROWEST:
+        return 4 * (rows * cols + looked_at)
+    padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
+    return 4 * (rows * cols + looked_at + _COPIES * (padded if rings == "wavelet" else views * cols))
+
+
+def _noise(values: NDArray[np.floating]) -> float:
+    """Standard deviation from view to view, robustly by second differences."""
+    return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))
+
+
+def _far_off(sinogram: F32, axis_col: float) -> bool:
+    """Whether columns are dead or far off: at most a fifth of all, none near the axis or with one on its other side."""
+    cleaned = without_large_stripes(without_dead_columns(sinogram))
+    changed = (cleaned != sinogram).any(axis=0).sum()
+    strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
+    columns = np.arange(strong.size)
+    across = np.rint(2 * axis_col - columns).astype(int)
+    seen = (across >= 0) & (across < strong.size)
+    mirrored = seen & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
+    own = strong & ~mirrored & (np.abs(columns - axis_col) > AT_AXIS)
+    return bool(own.any() and changed <= strong.size / 5)
+
+
+def _around(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:
+    return np.asarray(median_filter(values, 2 * (width // 2) + 1, mode="nearest"))
+
+
+def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
+    off = values - np.median(values)
+    return np.asarray(np.abs(off) > limit * max(median_deviation(off), 1e-12))
+
+
+def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
+    """Bad columns filled by the line between the good ones beside them; unchanged if more than half are bad."""
+    if not bad.any() or bad.mean() > 0.5:
+        return sinogram
+    good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)
+    after = np.clip(np.searchsorted(good, wanted), 0, good.size - 1)
+    left, right = good[np.clip(after - 1, 0, None)], good[after]
+    share = np.clip((wanted - left) / np.maximum(right - left, 1), 0, 1).astype(np.float32)
+    out = sinogram.copy()
+    out[:, wanted] = (1 - share) * sinogram[:, left] + share * sinogram[:, right]
+    return out
+
+
+def _analysed(values: NDArray[np.float64], axis: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Smooth and detail coefficients of a periodic signal along an axis, each half as long."""
+    values = np.moveaxis(values, axis, 0)
+    low = sum(h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5))
+    high = sum((-1) ** n * h * np.roll(values, -n, axis=0)[::2] for n, h in enumerate(_DB5[::-1]))
+    return np.moveaxis(np.asarray(low), 0, axis), np.moveaxis(np.asarray(high), 0, axis)
+
+
+def _synthesised(low: NDArray[np.float64], high: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """The signal of these coefficients: the transpose of `_analysed`, which is orthogonal."""
+    low, high = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
+    out = np.zeros((2 * len(low), *low.shape[1:]))
+    for n, (h, g) in enumerate(zip(_DB5, _DB5[::-1], strict=True)):
+        spread = np.zeros_like(out)
+        spread[::2] = h * low + (-1) ** n * g * high
+        out += np.roll(spread, n, axis=0)
+    return np.moveaxis(out, 0, axis)

@@ -1,0 +1,1 @@
+"""Surfaces where a volume, or the Gaussians behind it, cross a level."""

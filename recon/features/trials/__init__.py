@@ -1,0 +1,1 @@
+"""Figures of merit that trials of methods compare."""

@@ -1,0 +1,1 @@
+"""A pair of opposite views: axis, tilt and sharpness."""

@@ -1,0 +1,34 @@
+"""Faults of scintillator, optics and sensor."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from simulators.effects.domain import Domain, EffectRow
+
+_Row = partial(EffectRow, package=__name__)
+EFFECTS = {
+    "rolling_shutter": _Row(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
+    "afterglow": _Row(Domain.MOTION, "the scintillator still emits light of earlier moments"),
+    "scintillator_blur": _Row(
+        Domain.PHOTONS,
+        "scintillator and optics blur, and glare far away",
+        frozenset({"beam_profile", "beam_bend", "narrow_field", "black_band"}),
+        "the scintillator blurs all light that reaches it",
+    ),
+    "flat_structure": _Row(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
+    "prnu": _Row(
+        Domain.PHOTONS,
+        "pixels differ in how much light they detect",
+        frozenset({"scatter", "scintillator_blur"}),
+        "pixels differ in their response to light that is spread already",
+    ),
+    "hot_pixels": _Row(Domain.ELECTRONS, "a few pixels have a large dark current"),
+    "zingers": _Row(Domain.ELECTRONS, "stray X-rays hit the sensor"),
+    "dead_pixels": _Row(
+        Domain.ELECTRONS,
+        "a few pixels do not respond to light",
+        frozenset({"dark_current", "hot_pixels", "zingers"}),
+        "dead pixels hold a constant charge",
+    ),
+}

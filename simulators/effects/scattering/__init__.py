@@ -1,0 +1,19 @@
+"""What light does beside being absorbed by the sample: it is refracted and scattered, and meets crumbs on its way."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from simulators.effects.domain import Domain, EffectRow
+
+_Row = partial(EffectRow, package=__name__)
+EFFECTS = {
+    "floaters": _Row(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
+    "phase_fringes": _Row(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
+    "scatter": _Row(
+        Domain.PHOTONS,
+        "photons that the sample deflects arrive elsewhere",
+        frozenset({"beam_profile", "beam_bend", "narrow_field"}),
+        "the sample scatters the light that reaches it",
+    ),
+}

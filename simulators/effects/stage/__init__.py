@@ -1,0 +1,21 @@
+"""Errors of the stage, and of the sample on it."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from simulators.effects.domain import Domain, EffectRow
+
+_Row = partial(EffectRow, package=__name__)
+EFFECTS = {
+    "encoder_error": _Row(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
+    "backlash": _Row(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),
+    "stage_wobble": _Row(Domain.MOTION, "the rotation axis tilts as the stage turns"),
+    "runout": _Row(Domain.MOTION, "the rotation axis wanders as the stage turns"),
+    "jump": _Row(
+        Domain.MOTION,
+        "the sample slips on the stage once",
+        frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
+        "errors of the stage depend on the stage's angle, and the sample slips on the stage",
+    ),
+}

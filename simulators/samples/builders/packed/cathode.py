@@ -1,0 +1,149 @@
+"""Cathode: grains packed in electrolyte in a can, with a current collector below and a separator above if asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from simulators.frame.mapping import BelowOne, NotNegative, Positive, Share
+from simulators.samples.bodies.solids import Cylinder
+from simulators.samples.builders.packed.arrangement import arrange, bodies_of
+from simulators.samples.builders.packed.grains import Habit, Sizes, core, crack, grains
+from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
+
+MADE_OF: Mapping[str, str] = MappingProxyType(
+    {
+        "wall": "Al",
+        "electrolyte": "electrolyte",
+        "collector": "Al",
+        "separator": "separator",
+        "particle": "LiCoO2",
+        "pore": "electrolyte",
+        "crack": "electrolyte",
+    }
+)
+"""Material of each part by default."""
+
+GREY: Mapping[str, float] = MappingProxyType(
+    {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
+)
+"""Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
+transmits about 5 % at its thickest part."""
+
+
+@dataclass(frozen=True)
+class Cathode(PieceBuilder):
+    """A cell around the rotation axis.
+
+    The largest fill depends on the grains: 0.55 for spheres, 0.45 for the default habits, 0.35 for octahedra or plates
+    alone.
+
+    Attributes:
+        diameter, height: mm, of the can outside; it has neither lid nor bottom.
+        wall_um: thickness of the can's wall.
+        size_um: median diameter of spheres of the grains' volumes.
+        spread: standard deviation of the logarithm of the diameter; it is cut off at 2.5 of them. With 2 the largest
+            are 20 000 times the smallest.
+        fill: share of the volume between collector and separator that grains take, pores and cracks included. Balls
+            jam at 0.64.
+        habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
+        irregularity: largest relative change of a grain's axes.
+        aspect: width over thickness of plates.
+        hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
+        gap_um: between two grains, at least.
+        collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
+        seed: of all random numbers.
+    """
+
+    diameter: Positive = 0.6
+    height: Positive = 0.5
+    wall_um: Positive = 20.0
+    size_um: Micrometres = 25.0
+    spread: Annotated[float, Field(ge=0, le=2)] = 0.25
+    fill: Annotated[float, Field(ge=0, lt=0.64)] = 0.4
+    habits: Mapping[Habit, Annotated[float, Field(ge=0, le=1e9)]] = field(
+        default_factory=lambda: MappingProxyType(
+            {"octahedron": 0.4, "truncated_octahedron": 0.25, "ellipsoid": 0.2, "plate": 0.15}
+        )
+    )
+    irregularity: BelowOne = 0.1
+    aspect: Positive = 3.0
+    hollow: Share = 0.0
+    cracked: Share = 0.0
+    gap_um: Gap = 0.0
+    collector_um: NotNegative = 0.0
+    separator_um: NotNegative = 0.0
+    seed: int = 0
+
+    default_materials: ClassVar[Mapping[str, str]] = MADE_OF
+
+    def __post_init__(self) -> None:
+        if self.hollow + self.cracked > 1:
+            raise ValueError(f"hollow and cracked are shares, 1 at most in sum, got {self.hollow} and {self.cracked}")
+        if not sum(self.habits.values()) > 0:
+            raise ValueError(f"habits are shares, not all 0, got {dict(self.habits)}")
+        if not (self.inner_radius > 0 and self.bed_height > 0):
+            raise ValueError(f"there is no room for the cathode inside {self.diameter} x {self.height} mm")
+        check_roles(self)
+
+    @property
+    def inner_radius(self) -> float:
+        """mm, of the can."""
+        return self.diameter / 2 - self.wall_um * 1e-3
+
+    @property
+    def bed_height(self) -> float:
+        """mm, of the space for the grains."""
+        return self.height - (self.collector_um + self.separator_um) * 1e-3
+
+    @property
+    def default_attenuation(self) -> Mapping[str, float]:
+        return {role: value * 2 / self.diameter for role, value in GREY.items()}
+
+    def pieces(self) -> tuple[Piece, ...]:
+        """The can, its contents and the grains.
+
+        Raises:
+            ValueError: a grain is larger than the cell, or there is no room for all; see `arrange`.
+        """
+        rng = np.random.default_rng(self.seed)
+        radius, bed = self.inner_radius, self.bed_height
+        below, above = self.collector_um * 1e-3, self.separator_um * 1e-3
+        cell = [
+            Piece(Cylinder(self.diameter / 2, self.height, 1.0), "wall"),
+            Piece(Cylinder(radius, self.height, -1.0), "wall"),
+            Piece(Cylinder(radius, self.height, 1.0), "electrolyte"),
+        ]
+        if below:
+            foil = Cylinder(radius, below, 1.0, (0.0, 0.0, (below - self.height) / 2))
+            cell.append(Piece(foil, "collector", "electrolyte"))
+        if above:
+            film = Cylinder(radius, above, 1.0, (0.0, 0.0, (self.height - above) / 2))
+            cell.append(Piece(film, "separator", "electrolyte"))
+        sizes = Sizes(self.size_um * 1e-3, self.spread)
+        wanted = self.fill * math.pi * radius**2 * bed
+        loose = grains(rng, wanted, sizes, self.habits, self.irregularity, self.aspect)
+        if not loose and self.fill:
+            raise ValueError(
+                f"a grain of {self.size_um:g} um is larger than the whole fill of {self.fill:g}; make the cell larger "
+                "or the grains smaller"
+            )
+        if not loose:
+            return tuple(cell)
+        centres = arrange(rng, bodies_of(loose), radius, bed, self.gap_um * 1e-3)
+        centres[:, 2] += (below - above) / 2
+        for grain, (x, y, z) in zip(loose, centres.tolist(), strict=True):
+            placed = replace(grain, centre=(x, y, z))
+            cell.append(Piece(placed, "particle", "electrolyte"))
+            fate = rng.uniform()
+            if fate < self.hollow:
+                cell.append(Piece(core(placed), "pore", "particle"))
+            elif fate < self.hollow + self.cracked:
+                cell.append(Piece(crack(rng, placed), "crack", "particle"))
+        return tuple(cell)

@@ -1,0 +1,126 @@
+"""Materials: composition, density and attenuation at any X-ray energy.
+
+Cross sections, edges and level widths are those of xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011): the
+total mass attenuation, photoelectric and both kinds of scattering, from 0.1 to 800 keV. This module is imported only
+if a scene names a material.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xraylib
+from numpy.typing import ArrayLike, NDArray
+
+from simulators.samples.materials.edge import K_EDGES, MOST_SHIFT, near_edge
+
+Reals = NDArray[np.float64]
+LEAST_KEV, MOST_KEV = 0.1, 800.0
+AVOGADRO = 0.602214076  # 1e24 / mol
+
+
+@dataclass(frozen=True)
+class Material:
+    """Composition and density of a kind of matter.
+
+    Attributes:
+        name: in scenes and labels.
+        density: g/cm³.
+        fractions: (atomic number, share of the mass), of each element once.
+        state_of_charge: of a cathode material, 0 (fully lithiated) to 1: it then has the near-edge structure of
+            `edge`; None: the tables. Composition and density stay those of the discharged state:
+            lithium contributes about a thousandth of an oxide's attenuation.
+        edge_shift_ev: eV from the edge of state 0 to that of state 1, the same for Mn, Co and Ni, -20 ... 20; None:
+            the value in `edge`.
+    """
+
+    name: str
+    density: float
+    fractions: tuple[tuple[int, float], ...]
+    state_of_charge: float | None = None
+    edge_shift_ev: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.density < 100:
+            raise ValueError(f"{self.name}: density must lie between 0 and 100 g/cm3, got {self.density}")
+        if self.state_of_charge is None:
+            if self.edge_shift_ev is not None:
+                raise ValueError(f"{self.name}: edge_shift_ev needs a state_of_charge")
+            return
+        if not 0 <= self.state_of_charge <= 1:
+            raise ValueError(f"{self.name}: state_of_charge must lie in 0 ... 1, got {self.state_of_charge}")
+        if self.edge_shift_ev is not None and not abs(self.edge_shift_ev) <= MOST_SHIFT:
+            raise ValueError(f"{self.name}: edge_shift_ev must lie in -20 ... 20 eV, got {self.edge_shift_ev}")
+        if not K_EDGES.keys() & dict(self.fractions).keys():
+            symbols = ", ".join(xraylib.AtomicNumberToSymbol(z) for z in K_EDGES)
+            raise ValueError(f"{self.name}: state_of_charge is for an oxide with {symbols}; this has none of them")
+
+    def attenuation(self, energies: ArrayLike) -> Reals:
+        """Linear attenuation in 1/mm at `energies` in keV, float64, of their shape.
+
+        Raises:
+            ValueError: an energy is outside the tables.
+        """
+        e = np.asarray(energies, dtype=np.float64)
+        if not ((e >= LEAST_KEV) & (e <= MOST_KEV)).all():
+            raise ValueError(
+                f"attenuation is tabulated from {LEAST_KEV} to {MOST_KEV:g} keV; got {e.min():g} ... {e.max():g} keV"
+            )
+        flat = e.ravel()
+        cm2_per_g = sum((share * self._element(z, flat) for z, share in self.fractions), start=np.zeros_like(flat))
+        return (0.1 * self.density * cm2_per_g).reshape(e.shape)
+
+    def _element(self, z: int, energies: Reals) -> Reals:
+        """Mass attenuation of an element in cm²/g."""
+
+        def table(at: Reals) -> Reals:
+            return np.array([xraylib.CS_Total(z, float(energy)) for energy in at])
+
+        if self.state_of_charge is None or z not in K_EDGES:
+            return table(energies)
+        shape = K_EDGES[z] if self.edge_shift_ev is None else replace(K_EDGES[z], shift=self.edge_shift_ev)
+        edge, width = xraylib.EdgeEnergy(z, xraylib.K_SHELL), xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3
+        return near_edge(energies, table, edge, width, shape, self.state_of_charge)
+
+
+def of_formula(name: str, formula: str, density: float) -> Material:
+    """A material by chemical formula ("LiNi0.6Mn0.2Co0.2O2") and density in g/cm³.
+
+    Raises:
+        ValueError: not a formula, or not a density.
+    """
+    return Material(name, density, _fractions(formula))
+
+
+def by_mass(name: str, density: float, parts: Mapping[str, float]) -> Material:
+    """A mixture of formulas by their shares of the mass, of any sum."""
+    total: dict[int, float] = {}
+    for formula, mass in parts.items():
+        for z, share in _fractions(formula):
+            total[z] = total.get(z, 0.0) + mass / sum(parts.values()) * share
+    return Material(name, density, tuple(sorted(total.items())))
+
+
+def by_volume(name: str, one: Material, other: Material, share: float) -> Material:
+    """`share` of the volume is `one`, the rest `other`."""
+    masses = (share * one.density, (1 - share) * other.density)
+    total: dict[int, float] = {}
+    for mass, material in zip(masses, (one, other), strict=True):
+        for z, fraction in material.fractions:
+            total[z] = total.get(z, 0.0) + mass / sum(masses) * fraction
+    return Material(name, sum(masses), tuple(sorted(total.items())))
+
+
+def layered_oxide(name: str, formula: str, a: float, c: float) -> Material:
+    """A layered oxide (space group R-3m, three formula units a hexagonal cell): the crystal's density, by a and c in
+    Å."""
+    atoms = xraylib.CompoundParser(formula)
+    mass = sum(n * xraylib.AtomicWeight(z) for z, n in zip(atoms["Elements"], atoms["nAtoms"], strict=True))
+    return of_formula(name, formula, 3 * mass / (AVOGADRO * 3**0.5 / 2 * a**2 * c))
+
+
+def _fractions(formula: str) -> tuple[tuple[int, float], ...]:
+    parsed = xraylib.CompoundParser(formula)
+    return tuple(zip(parsed["Elements"], parsed["massFractions"], strict=True))

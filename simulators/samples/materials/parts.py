@@ -1,0 +1,188 @@
+"""Parts: solids with materials, and the sample that they form in a beam.
+
+Overlapping solids add up, so that a part that displaces another material counts with the difference of the two. Grey
+parts have the same attenuation at every energy.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from recon.base.volume import Grid
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.light.beam import Beam
+from simulators.pixels.bands import share_rows
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Solid, kind_of
+from simulators.samples.materials.spectrum import Attenuation, Spectrum, light
+from simulators.samples.sample import Sample
+
+if TYPE_CHECKING:  # the tables are loaded only if a scene names a material
+    from simulators.samples.materials.materials import Material
+
+Reals = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A solid and its material.
+
+    Attributes:
+        solid: without a material its attenuation is in 1/mm. With one it is the share of the solid's volume that the
+            material fills, 1 for all of it.
+        material: None: grey.
+        instead_of: the material that it displaces; None: nothing.
+        name: of its label; None: the material's name, or the solid's kind.
+    """
+
+    solid: Solid
+    material: Material | None = None
+    instead_of: Material | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.material is None and self.instead_of is not None:
+            raise ValueError(f"instead_of {self.instead_of.name!r} needs a material that displaces it")
+
+    @property
+    def label(self) -> str:
+        return self.name or (self.material.name if self.material else kind_of(self.solid))
+
+
+@dataclass(frozen=True, eq=False)
+class Constituent:
+    """One kind of matter in a sample.
+
+    Attributes:
+        chords: its thickness along a ray, mm; the optical depth if it is grey.
+        material: None: grey.
+        instead_of: the material that it displaces.
+    """
+
+    chords: Sample
+    material: Material | None = None
+    instead_of: Material | None = None
+
+    def attenuation(self, energies: ArrayLike) -> Reals:
+        """1/mm, minus that of the displaced material, at energies in keV; same shape as the energies."""
+        if self.material is None:
+            return np.ones(np.shape(energies))
+        own = self.material.attenuation(energies)
+        return own if self.instead_of is None else own - self.instead_of.attenuation(energies)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Constituents under a spectrum: each one's chords are computed once for any number of energies.
+
+    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam. That is the
+    initial slope of the effective depth. Thicker matter appears to attenuate less: beam hardening.
+
+    Attributes:
+        constituents: of the sample.
+        spectrum: energies and weights.
+        whole: the sample with its attenuation in the thin limit.
+    """
+
+    constituents: tuple[Constituent, ...]
+    spectrum: Spectrum
+    whole: Sample
+
+    @property
+    def radius(self) -> float:
+        return self.whole.radius
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.whole.names
+
+    def thickness(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
+        """mm of each constituent along each ray, float64 [constituent, row, col]."""
+        return np.stack([c.chords.line_integrals(angle, detector) for c in self.constituents])
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
+        """The effective depth; see `effective_depth` and Sample.line_integrals."""
+        attenuation = np.stack([c.attenuation(self.spectrum.energies) for c in self.constituents], axis=1)
+        return effective_depth(self.thickness(angle, detector), attenuation, self.spectrum.weights)
+
+    def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
+        return self.whole.attenuation(grid, supersample)
+
+    def labels(self, grid: Grid) -> NDArray[np.uint8]:
+        return self.whole.labels(grid)
+
+    def under(self, spectrum: Spectrum) -> Mixture:
+        """The same sample in another spectrum; its truth remains that of the original one."""
+        return replace(self, spectrum=spectrum)
+
+
+def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenuation] | None = None) -> Sample:
+    """The sample that the parts form in the beam: a phantom for one energy, a mixture for more.
+
+    Args:
+        filters: the attenuation of a material by its name, for a tube; None: known materials only.
+
+    Raises:
+        ValueError: a material in a beam that does not state its energies, or states some that are not tabulated.
+    """
+    names = [part.label for part in parts]
+    kinds = dict.fromkeys((part.material, part.instead_of) for part in parts)
+    if all(material is None for material, _ in kinds):
+        return Phantom.of([part.solid for part in parts], names)
+    groups = tuple(
+        Constituent(Phantom.of([part.solid for part in parts if (part.material, part.instead_of) == kind]), *kind)
+        for kind in kinds
+    )
+    from simulators.samples.materials.palette import Palette
+
+    reach = 2 * Phantom.of([part.solid for part in parts]).radius
+    matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
+    spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)
+    thin = {kind: spectrum.mean(group.attenuation) for kind, group in zip(kinds, groups, strict=True)}
+    solids = [
+        replace(part.solid, attenuation=part.solid.attenuation * thin[part.material, part.instead_of]) for part in parts
+    ]
+    whole = Phantom.of(solids, names)
+    return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)
+
+
+ROUNDING = 1e-14  # A smaller depth counts as no matter
+
+
+def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:
+    """The optical depth that a detector measures which integrates over all energies, float64 [row, col].
+
+    It is -log(sum_e w_e exp(-sum_m attenuation[e, m] thickness[m])).
+
+    Args:
+        thickness: mm, float64 [constituent, row, col].
+        attenuation: 1/mm, float64 [energy, constituent].
+        weights: float64 [energy], of sum 1.
+    """
+    out = np.zeros(thickness.shape[1:])
+
+    def work(first: int, end: int) -> None:
+        chords = thickness[:, first:end]
+        hit = (chords != 0.0).any(axis=0)  # air is exactly 0
+        matter = chords[:, hit]
+        least = functools.reduce(np.minimum, (_through(matter, mu) for mu in attenuation))
+        light = np.zeros_like(least)  # with the hardest energy factored out, against underflow
+        for weight, mu in zip(weights, attenuation, strict=True):
+            light += weight * np.exp(least - _through(matter, mu))
+        depth = least - np.log(light)
+        out[first:end][hit] = np.where(np.abs(depth) < ROUNDING, 0.0, depth)
+
+    share_rows(work, (thickness.shape[1], thickness.shape[2]))
+    return out
+
+
+def _through(matter: Reals, attenuation: Reals) -> Reals:
+    """Optical depth at one energy; not by BLAS, whose sums depend on where a ray lies in the array."""
+    return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, matter, strict=True)))

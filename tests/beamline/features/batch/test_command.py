@@ -1,0 +1,213 @@
+"""Batches: each scan gets its volume, a failure is named, and a second call does only what is left."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.features.batch import batch, command, recon_worker
+from beamline.features.batch.batch import BatchOptions, BatchRow, Worker, names_of, run_batch
+from beamline.storage.writer_lock import WriterLock
+from beamline.storage.writers.recon_file import read_reconstruction
+from drivers.base.clock import SystemClock
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def _table(folder: Path) -> dict[str, dict[str, str]]:
+    with (folder / "batch.csv").open(encoding="utf-8", newline="") as file:
+        return {row["name"]: row for row in csv.DictReader(file)}
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans are reconstructed without a process of their own, which takes seconds to start."""
+
+    def run(worker: Worker, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int, str]:
+        result = beamline(*arguments)
+        for text in result.stdout.splitlines():
+            on_line(text)
+        return result.exit_code, (result.stderr.splitlines() or [""])[-1]
+
+    monkeypatch.setattr(Worker, "run", run)
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\naxis: 19.5\n")
+    (folder / "a").mkdir()
+    write_exchange(folder / "a" / "scan.h5", SCAN)
+    Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes()[:2000])
+    given = ("batch", "*scan.h5", "a/*.h5", "cut.h5", "--config", "recipe.yaml", "-o", "out")
+
+    planned = beamline(*given, "--dry-run")
+    assert planned.exit_code == 0 and "3; 3 to be reconstructed; 1 of them would fail" in planned.stdout
+    assert "cut: " in planned.stdout and "time      about" in planned.stdout
+    assert not Path("out").exists()
+    first = beamline(*given)
+    assert first.exit_code == 5
+    assert "1 of 3 scans failed" in first.output
+    table = _table(folder / "out")
+    assert {name: row["state"] for name, row in table.items()} == {
+        f"{folder.name}_scan": "done", "a_scan": "done", "cut": "failed",
+    }  # fmt: skip
+    assert "cut.h5" in table["cut"]["message"]
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", "a_scan", f"{folder.name}_scan"}
+    assert left(folder / "out" / "a_scan") == {"recon.h5", "report.html", "log.txt"}
+    beamline("recon", "scan.h5", "--config", "recipe.yaml", "-o", "alone.h5", "--no-report")
+    alone, found = (read_reconstruction(Path(name)) for name in ("alone.h5", "out/a_scan/recon.h5"))
+    np.testing.assert_array_equal(found.volume.data, alone.volume.data)
+    assert float(table["a_scan"]["residual"]) == alone.metrics["residual"]
+
+    before = (folder / "out" / "a_scan" / "recon.h5").stat().st_mtime_ns
+    Path("cut.h5").write_bytes((folder / "scan.h5").read_bytes())
+    rest = json.loads(beamline(*given, "--dry-run", "--json").stdout)
+    alone_needs = json.loads(beamline("recon", "cut.h5", "--config", "recipe.yaml", "--dry-run", "--json").stdout)
+    assert list(rest["needs"]) == ["cut"]
+    assert all(rest[name] == rest["needs"]["cut"][name] == alone_needs[name] for name in ("seconds", "memory"))
+    second = beamline(*given)
+    assert second.exit_code == 0, second.output
+    assert _table(folder / "out")["cut"]["state"] == "done"
+    assert (folder / "out" / "a_scan" / "recon.h5").stat().st_mtime_ns == before
+
+    Path("recipe.yaml").write_text("method: sirt\n")
+    other = beamline(*given)
+    assert other.exit_code == 5
+    assert "another recipe" in other.output
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share_a_folder(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\n")
+    given = ("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
+    assert beamline(*given).exit_code == 0
+    (folder / "out" / "batch.csv").write_text("name,scan,state,seconds,method,residual,message\n")
+    before = (folder / "out" / "scan" / "recon.h5").stat().st_mtime_ns
+    assert beamline(*given).exit_code == 0
+    assert (folder / "out" / "scan" / "recon.h5").stat().st_mtime_ns == before
+    assert _table(folder / "out")["scan"]["state"] == "done"
+    other = WriterLock(folder / "out" / "recipe.yaml")
+    refused = beamline(*given)
+    other.release()
+    assert refused.exit_code == 5
+    assert "Another batch works in out" in refused.output
+
+
+def test_a_folder_of_something_else_is_refused(folder: Path) -> None:
+    (folder / "out").mkdir()
+    result = beamline("batch", "scan.h5", "-o", "out")
+    assert result.exit_code == 5
+    assert left(folder / "out") == set()
+    assert beamline("batch", "no*.h5", "-o", "new").exit_code == 2
+
+
+def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(folder / "second.h5", SCAN)
+    done: list[str] = []
+
+    def run(worker: Worker, arguments: Sequence[str], on_line: object) -> tuple[int, str]:
+        output = Path(arguments[arguments.index("--output") + 1])
+        if done:
+            output.with_suffix(".h5.partial").touch()
+            raise KeyboardInterrupt
+        done.append(arguments[1])
+        output.touch()
+        return 0, ""
+
+    monkeypatch.setattr(Worker, "run", run)
+    result = beamline("batch", "scan.h5", "second.h5", "-o", "out")
+    assert result.exit_code == 4
+    assert {name: row["state"] for name, row in _table(folder / "out").items()} == {"scan": "done", "second": "waiting"}
+    assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
+
+
+WORKS = """
+import json, os, sys, time
+for line in sys.stdin:
+    (what,) = json.loads(line)
+    print(json.dumps({"event": "at work", "pid": os.getpid()}), flush=True)
+    if what == "crash":
+        print("out of memory", file=sys.stderr, flush=True)
+        os.abort()
+    if what == "hang":
+        time.sleep(600)
+    print(json.dumps({"event": "ended", "exit_code": int(what)}), flush=True)
+"""
+
+
+def test_a_worker_takes_scan_after_scan_and_another_one_follows_a_failure(tmp_path: Path) -> None:
+    lines: list[str] = []
+    given, log = ("0", "0", "6", "0", "5", "0", "crash", "0", "hang", "0"), tmp_path / "log.txt"
+    with Worker(log, (sys.executable, "-c", WORKS), silence=1.5) as worker:
+        found = [worker.run([what], lines.append) for what in given]
+    codes = [code for code, _ in found]
+    assert codes[:6] == [0, 0, 6, 0, 5, 0]
+    assert (codes[6] not in (0, 5, 6), codes[7:]) == (True, [0, None, 0])
+    assert found[6][1] == "out of memory"
+    assert "it hung" in found[8][1]
+    pids = [json.loads(line)["pid"] for line in lines]
+    changes = [n for n in range(1, len(given)) if pids[n] != pids[n - 1]]
+    assert changes == [5, 7, 9]  # after a failure, a crash, a scan that hung
+    assert not log.exists()
+
+
+def test_the_worker_gives_the_exit_codes_of_the_command(tmp_path: Path) -> None:
+    assert recon_worker.run(["info", str(tmp_path / "none.h5")]) == 5
+    assert recon_worker.run(["info", "--no-such-option"]) == 2
+    assert recon_worker.run(["config", "init"]) == 0
+
+
+@pytest.mark.slow
+def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_kept_and_named(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\nmax-residual: 1e-6\n")
+    (row,) = run_batch(BatchOptions([Path("scan.h5")], Path("recipe.yaml"), Path("out")), lambda _: None, SystemClock())
+    assert row.state == "poor"
+    assert "--max-residual" in row.message
+    assert Path("out/scan/recon.h5").is_file()
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize(
+    ("recipe", "sentence"),
+    [
+        ("axis: try:19:20:0.5", "beamline sweep FILE axis=19:20:0.5"),
+        ("method: fbp\niterations: 5", "--iterations is of fista-tv, os-sirt-tv, pnp-dct, mlem, osem, sirt"),
+        ("method: fpb", "did you mean fbp?"),
+        ("methd: fbp", "did you mean method?"),
+        ("method: r2\nset: fit.magic=1", "'fit.magic' is unknown"),
+    ],
+)
+def test_a_recipe_of_no_volume_is_refused_at_once(folder: Path, recipe: str, sentence: str) -> None:
+    Path("recipe.yaml").write_text(recipe + "\n")
+    result = beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
+    assert result.exit_code == 2 and sentence in result.output
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("paths", "names"),
+    [
+        (("/x/a.h5", "/x/b.h5"), ["a", "b"]),
+        (("/x/run1/scan.h5", "/x/run2/scan.h5", "/x/c.h5"), ["run1_scan", "run2_scan", "c"]),
+        (("/1/r/s.h5", "/2/r/s.h5"), ["1_r_s", "2_r_s"]),
+        (("/x/s.h5", "/x/s.tif"), ["x_s_0", "x_s_1"]),
+        (("/a/Tooth.h5", "/b/tooth.h5"), ["a_Tooth", "b_tooth"]),  # one folder on some disks
+    ],
+)  # fmt: skip
+def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> None:
+    assert names_of([Path(path) for path in paths]) == names
+
+
+def test_rows_of_an_earlier_call_keep_their_names() -> None:
+    known = [BatchRow("scan", "/x/run1/scan.h5", "done")]
+    rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
+    assert [row.name for row in rows] == ["scan", "run2_scan"]
+    assert command.batch.name == "batch"

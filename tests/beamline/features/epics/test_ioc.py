@@ -1,0 +1,184 @@
+"""A client of EPICS sees a run go on, and a next one, and ends it where it may."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.features.epics.ioc import RunServer, RunValues
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+thread = pytest.importorskip("p4p.client.thread")
+WITHIN = 60.0  # s
+
+
+@contextmanager
+def _served(runs: Path, *, control: bool = False) -> Iterator[tuple[RunServer, Any]]:
+    """The server, and a client that finds it by its port alone."""
+    with closing(RunServer(runs, "T:", "127.0.0.1", control, lambda line: None)) as server:
+        port = server.configuration["EPICS_PVAS_SERVER_PORT"]
+        conf = {"EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{port}", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        with closing(thread.Context("pva", conf=conf, useenv=False)) as client:
+            yield server, client
+
+
+def _until(server: RunServer, met: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WITHIN
+    while not met():
+        assert time.monotonic() < deadline
+        server.look()
+        time.sleep(0.1)
+
+
+def _put(server: RunServer, client: Any, name: str) -> None:
+    """Write true, and look as `beamline ioc` does, until the scan has obeyed."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(client.put, name, True, timeout=WITHIN)
+        _until(server, answer.done)
+    answer.result()
+
+
+def test_without_a_run_it_is_idle_and_beats(tmp_path: Path) -> None:
+    with _served(tmp_path) as (server, client):
+        assert client.get("T:ScanStatus") == "idle" and client.get("T:ImagesPlanned") == -1
+        server.look()
+        first = int(client.get("T:Heartbeat"))
+        server.look()
+        assert int(client.get("T:Heartbeat")) == first + 1
+
+
+def test_a_finished_run_and_the_next_one(tmp_path: Path) -> None:
+    def run(name: str, sample: str, began: float) -> None:
+        (tmp_path / name).mkdir()
+        write_flagged(tmp_path / name / "scan.h5", frames_of(TwoCylinders()), {})
+        started = (
+            f'{{"event": "run_started", "time": {began}, "folder": "{name}", "path": "{name}/scan.h5", '
+            f'"sample": "{sample}", "n_frames": 98}}\n{{"event": "state", "time": {began}, "state": "done"}}\n'
+        )
+        (tmp_path / name / "events.jsonl").write_text(started, encoding="utf-8")
+
+    run("2026-01-01T000000_a", "first", 1.0)
+    with _served(tmp_path) as (server, client):
+        server.look()
+        assert (client.get("T:SampleName"), client.get("T:ScanStatus")) == ("first", "done")
+        assert client.get("T:ImagesSaved") == 49 and client.get("T:PercentComplete") == 50.0
+        run("2026-01-01T000001_b", "second", 2.0)
+        server.look()
+        assert client.get("T:SampleName") == "second"
+
+
+def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> None:
+    (tmp_path / "2026-01-01T000000_a").mkdir()
+    run = tmp_path / "2026-01-01T000000_a"
+    scan = TwoCylinders()
+    write_flagged(run / "scan.h5", frames_of(scan), {})
+    events = [
+        {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98},
+        {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
+        {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
+    ]
+    (run / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events), encoding="utf-8")
+    begin = time.time()
+    with _served(tmp_path) as (server, client):
+        server.look()
+        time.sleep(0.5)
+        alarm = {
+            name: (value.severity, value.timestamp)
+            for name in (
+                "SampleName", "Alarms", "LastFlag", "ScanStatus", "Message", "ImagesSaved", "Beam", "Heartbeat",
+                "Warnings", "DiskFree",
+            )
+            for value in [client.get(f"T:{name}")]
+        }  # fmt: skip
+        assert client.get("T:ScanStatus").raw.alarm.message == "the stage does not answer"
+    newest = frames_of(scan)[-1].time
+    assert alarm["SampleName"] == (0, 1.7e9) and alarm["Warnings"] == (0, 1.7e9)
+    assert alarm["Alarms"] == alarm["LastFlag"] == (2, 1.7e9 + 1.25)
+    assert alarm["ScanStatus"] == alarm["Message"] == (2, 1.7e9 + 2.5)
+    assert alarm["ImagesSaved"] == (0, pytest.approx(newest, abs=1e-6))
+    assert alarm["Beam"][0] == 3
+    for name in ("Beam", "Heartbeat", "DiskFree"):
+        assert begin <= alarm[name][1] <= time.time()
+
+
+def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path) -> None:
+    begin = time.time()
+    with _served(tmp_path, control=True) as (_, client):
+        named = [each.metadata["pv"] for each in fields(RunValues)]
+        for name in [*named, "Heartbeat", "PauseScan", "ResumeScan", "StopScan", "AbortScan"]:
+            assert begin <= client.get(f"T:{name}").timestamp <= time.time()
+
+
+def test_a_monitor_gets_each_frame_with_its_time(tmp_path: Path) -> None:
+    """Also where the value is the one before."""
+    run = tmp_path / "2026-01-01T000000_a"
+    run.mkdir()
+    write_flagged(run / "scan.h5", frames_of(TwoCylinders()), {})
+    log = run / "events.jsonl"
+    started = {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a", "sample": "s", "n_frames": 98}
+    log.write_text(json.dumps(started) + "\n", encoding="utf-8")
+    seen: list[float] = []
+    with _served(tmp_path) as (server, client):
+        server.look()
+        with closing(client.monitor("T:FrameRate", lambda value: seen.append(value.timestamp))):
+            for second in (1, 2, 3):
+                frame = {
+                    "event": "frame", "time": 1.7e9 + second, "n": second, "frames_per_s": 2.0, "mb_per_s": 1.0,
+                    "eta_s": 5.0, "mean": 1.0,
+                }  # fmt: skip
+                with log.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(frame) + "\n")
+                _until(server, lambda: (1.7e9 + second) in seen)  # noqa: B023 - called at once
+    assert seen[-3:] == [1.7e9 + 1, 1.7e9 + 2, 1.7e9 + 3]
+
+
+def test_without_control_there_is_no_verb(tmp_path: Path) -> None:
+    with _served(tmp_path) as (_, client), pytest.raises(TimeoutError):
+        client.put("T:AbortScan", True, timeout=1.0)
+
+
+def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
+    with _served(tmp_path, control=True) as (_, client):
+        with pytest.raises(thread.RemoteError, match="There is no run"):
+            client.put("T:StopScan", True, timeout=WITHIN)
+        after = client.get("T:StopScan")
+        assert (bool(after), after.severity) == (False, 2) and "There is no run" in after.raw.alarm.message
+
+
+def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:
+    command = [
+        sys.executable, "-m", "beamline.cli.main", "scan", "configs/simulated.yaml", "--no-live", "-o", str(tmp_path),
+        "--set", "scan.period_s=0.2", "--set", "scan.angles.views=2000",
+    ]  # fmt: skip
+    with _served(tmp_path, control=True) as (server, client):
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as scan:
+            assert scan.stderr is not None
+            _until(server, lambda: client.get("T:ScanStatus") == "acquiring" and client.get("T:ImagesSaved") > 6)
+            _until(server, lambda: client.get("T:ImagesPlanned") > 2000 and client.get("T:FrameRate") > 0)
+            _put(server, client, "T:PauseScan")
+            _until(server, lambda: client.get("T:ScanStatus") == "paused")
+            _put(server, client, "T:ResumeScan")
+            _until(server, lambda: client.get("T:ScanStatus") == "acquiring")
+            rate = client.get("T:FrameRate")
+            _put(server, client, "T:StopScan")
+            scan.stderr.read()
+            assert scan.wait(WITHIN) == 4
+        _until(server, lambda: client.get("T:ScanStatus") == "stopped")
+        assert rate == rate and client.get("T:FrameRate") != client.get("T:FrameRate")  # no rate when nothing moves
+
+
+def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "p4p.nt", None)
+    with pytest.raises(ConfigError, match=r"splatline\[epics\]"):
+        RunServer(tmp_path, "T:", "127.0.0.1", False, print)

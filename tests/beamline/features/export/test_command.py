@@ -1,0 +1,163 @@
+"""`beamline export`: formats, grey values, what is refused and what is left."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image, ImageSequence
+
+from beamline.storage.volumes.files import opened_volume, write_volume
+from beamline.storage.writers.recon_file import ReconRecord
+from recon.base.volume import Grid, Volume
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+from tests.beamline.scans import write_exchange
+
+VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
+
+
+@pytest.fixture
+def volume(folder: Path) -> Path:
+    grid = Grid(VALUES.shape, 0.5)
+    write_volume(
+        folder / "v.h5",
+        ReconRecord(
+            volume=Volume(VALUES, grid),
+            length_unit="mm",
+            raw_file="scan.h5",
+            title="t",
+            sample="s",
+            time=0.0,
+            parameters={"method": "fbp"},
+        ),
+    )
+    return folder
+
+
+def test_a_film_of_a_scan_shows_its_line_integrals_by_angle(folder: Path) -> None:
+    order = np.random.default_rng(5).permutation(SCAN.angles.size)
+    write_exchange(folder / "mixed.h5", replace(SCAN, angles=SCAN.angles[order]))
+    result = beamline("export", "mixed.h5", "-o", "f.gif", "--film", "views", "--window", "0:2", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout.splitlines()[-1])["images"] == SCAN.angles.size
+    with Image.open(folder / "f.gif") as gif:
+        images = np.stack([np.asarray(image.convert("L"), float) for image in ImageSequence.Iterator(gif)])
+    assert np.abs(images / 255 * 2 - SCAN.line_integrals()).max() < 0.02
+
+
+def test_values_stay_as_they_are(volume: Path) -> None:
+    for name in ("v.tif", "v", "v.npy", "v.nrrd", "copy.h5"):
+        result = beamline("export", "v.h5", "-o", name)
+        assert result.exit_code == 0, result.output
+        with opened_volume(volume / name) as read:
+            np.testing.assert_array_equal(read.volume.data[:], VALUES)
+    assert beamline("export", "v", "-o", "again.h5").exit_code == 0
+    with opened_volume(volume / "again.h5") as read, opened_volume(volume / "v.h5") as first:
+        np.testing.assert_array_equal(read.volume.data[:], VALUES)
+        assert (read.volume.grid, read.parameters) == (first.volume.grid, first.parameters)
+
+
+def test_volumes_of_others(folder: Path) -> None:
+    np.savez(folder / "other.npz", v=VALUES, voxel_mm=0.5)
+    assert beamline("export", "other.npz", "-o", "v.h5").exit_code == 0
+    with opened_volume(folder / "v.h5") as read:
+        np.testing.assert_array_equal(read.volume.data[:], VALUES)
+        assert (read.volume.grid.voxel_size, read.length_unit) == (0.5, "mm")
+
+
+def test_grey_values_say_what_was_clipped(volume: Path) -> None:
+    result = beamline("export", "v.h5", "-o", "g.tif", "--bits", "8", "--window", "0:1", "--json")
+    assert result.exit_code == 0, result.output
+    done = json.loads(result.stdout.splitlines()[-1])
+    outside = float(((VALUES < 0) | (VALUES > 1)).mean())
+    assert (done["bits"], done["window"], done["clipped"]) == (8, [0.0, 1.0], pytest.approx(outside))
+    grey = tifffile.imread(volume / "g.tif")
+    assert grey.dtype == np.uint8
+    assert np.abs(grey / 255 - np.clip(VALUES, 0, 1)).max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        (["-o", "v.png"], 2, "'.png' is not known"),
+        (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
+        (["-o", "no/v.tif"], 5, "does not exist"),
+        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
+        (["-o", "g.tif", "--window", "0:1"], 2, "give --bits 8"),
+        (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
+        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "no window"),
+        (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
+        (["-o", "v.gif"], 2, "--film goes with the suffixes .gif and .mp4"),
+        (["-o", "v.tif", "--film", "z"], 2, "--film goes with the suffixes .gif and .mp4"),
+        (["-o", "v.tif", "--fps", "3"], 2, "--fps is of --film"),
+        (["-o", "v.gif", "--film", "z", "--bits", "8"], 2, "its images have 8 bits"),
+        (["-o", "v.gif", "--film", "views"], 5, "holds no scan"),
+    ],
+)
+def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[str], code: int, said: str) -> None:
+    before = left(volume)
+    result = beamline("export", "v.h5", *options)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr and result.stdout == ""
+    assert left(volume) == before
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([], "Every value of the slices looked at is 0: there is no window"),
+        ([((3, 4, 5), 2.5)], "lie in 0:2.5. "),
+        ([(0, 1.5)], "lie in 0:1.5. "),
+        ([(..., 1.0), ((..., slice(0, 3)), 1e-6)], "lie in 1:1.000001. "),
+        ([(..., np.nan)], "No value of the slices looked at is finite"),
+    ],
+)
+def test_a_window_is_proposed_that_can_be_given(folder: Path, values: list[Any], said: str) -> None:
+    data = np.zeros((9, 40, 40), np.float32)
+    for where, value in values:
+        data[where] += np.float32(value)
+    np.save(folder / "v.npy", data)
+    result = beamline("export", "v.npy", "-o", "g.tif", "--bits", "16")
+    assert result.exit_code == 2 and said in result.stderr
+    if (window := re.search(r"lie in (\S+)\. ", result.stderr)) is not None:
+        assert beamline("export", "v.npy", "-o", "g.tif", "--bits", "16", "--window", window[1]).exit_code == 0
+        assert np.ptp(tifffile.imread(folder / "g.tif")) > 30_000
+
+
+def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None:
+    data = np.random.default_rng(2).random((12, 8, 9)).astype(np.float32)
+    (folder / "slices").mkdir()
+    for z, values in enumerate(data):
+        tifffile.imwrite(folder / f"slices/rec_{z}.tif", values)  # 9 before 10, as numbers
+    (folder / "slices/._rec_0.tif").write_bytes(b"\0\5\26\7")
+    assert beamline("export", "slices", "-o", "v.npy").exit_code == 0
+    np.testing.assert_array_equal(np.load(folder / "v.npy"), data)
+    tifffile.imwrite(folder / "slices/rec_12.tif", data[0, :4])
+    assert (
+        "rec_12.tif is float32 (4, 9); expected slices [y, x] alike"
+        in beamline("export", "slices", "-o", "w.npy").stderr
+    )
+    (folder / "empty").mkdir()
+    assert "empty is a folder without TIFF slices" in beamline("export", "empty", "-o", "w.npy").stderr
+    assert "There is no volume none" in beamline("export", "none", "-o", "w.npy").stderr
+
+
+def test_what_is_no_volume_is_refused(volume: Path) -> None:
+    assert beamline("export", "v.h5", "-o", "g.tif", "--bits", "16", "--window", "0:1").exit_code == 0
+    (volume / "empty").mkdir()
+    before = left(volume)
+    for name, said in (
+        ("g.tif", "grey values"),
+        ("scan.h5", "volumes"),
+        ("empty", "is a folder"),
+        ("none.h5", "no vol"),
+    ):
+        result = beamline("export", name, "-o", "out.nrrd")
+        assert (result.exit_code, said in result.stderr) == (5, True), result.output
+    assert left(volume) == before

@@ -1,0 +1,5 @@
+"""Small scans, as those of the tests of the storage."""
+
+from tests.beamline.storage.conftest import clock, frames, write
+
+__all__ = ["clock", "frames", "write"]

@@ -1,0 +1,307 @@
+"""`beamline info`, `validate` and `ingest`: what they print, their codes, and what they leave."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.monitor.digest import digest
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import SystemClock
+from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange, write_flagged
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written")
+    write_exchange(folder / "exchange.h5", SCAN)
+    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, energy_kev=25.0)
+    with NXtomoWriter(folder / "scan.h5", info, SCAN.shape, clock=SystemClock()) as writer:
+        for frame in frames_of(SCAN):
+            writer.append(frame, digest(frame.counts))
+    return folder
+
+
+@pytest.fixture
+def folder(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with a good scan in it, as NXtomo and as Data Exchange."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("exchange.h5", "scan.h5"):
+        shutil.copyfile(written / name, tmp_path / name)
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+@pytest.mark.parametrize(
+    "command", ["segment loop.h5", "export scan.h5 -o loop.h5", "simulate plain --frames 2 --out loop.h5"]
+)
+def test_a_link_that_leads_to_itself_is_a_file_that_is_not_there(folder: Path, command: str) -> None:
+    (folder / "loop.h5").symlink_to("loop.h5")
+    result = _beamline(*command.split())
+    assert result.exit_code in (2, 5) and "loop.h5" in result.stderr, result.output
+    assert (folder / "loop.h5").is_symlink()
+
+
+def test_info_for_people(folder: Path) -> None:
+    result = _beamline("info", "scan.h5")
+    assert result.exit_code == 0, result.output
+    said = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    assert said["format"] == "nxtomo"
+    assert said["kinds"] == "18 projection, 2 flat, 2 dark"
+    assert said["shape"] == "4 x 40"
+    assert said["last_angle_deg"] == "170"
+    assert said["axis_col"] == "not known"
+    assert said["reconstructable"] == "yes"
+    assert said["sample"] == "two cylinders"
+
+
+def test_info_takes_a_line_for_each_fact_of_a_volume(folder: Path) -> None:
+    assert _beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
+    lines = _beamline("info", "v.h5").stdout.splitlines()
+    assert [line.split(maxsplit=1)[1] for line in lines if line.startswith("recipe ")] == ["method: fbp; axis: 19.5"]
+
+
+def test_info_for_machines(folder: Path) -> None:
+    result = _beamline("info", "exchange.h5", "--json")
+    (line,) = result.stdout.splitlines()
+    said = json.loads(line)
+    assert (said["event"], said["quantity"], said["pixel_size_mm"]) == ("done", "counts", 0.5)
+    assert said["kinds"] == {"projection": 18, "flat": 2, "dark": 2}
+
+
+def test_what_the_file_calls_by_the_same_name_stays_apart(folder: Path) -> None:
+    with h5py.File("exchange.h5", "r+") as file:
+        file.attrs["quantity"] = "NOT what we call it"
+    lines = _beamline("info", "exchange.h5").stdout.splitlines()
+    assert [" ".join(line.split()) for line in lines if line.startswith("quantity")] == [
+        "quantity counts",
+        "quantity (of the file) NOT what we call it",
+    ]
+
+
+def test_info_takes_what_the_caller_says(folder: Path) -> None:
+    with h5py.File("exchange.h5", "r+") as file:
+        del file["exchange/data_white"], file["exchange/data_dark"]
+    assert "quantity" in _beamline("info", "exchange.h5").stdout
+    result = _beamline("info", "exchange.h5", "--quantity", "line-integrals")
+    assert "line_integrals" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["info", "validate"])
+@pytest.mark.parametrize("name", ["missing.h5", "text.h5"])
+def test_unreadable_files(folder: Path, command: str, name: str) -> None:
+    (folder / "text.h5").write_text("no scan")
+    result = _beamline(command, name)
+    assert result.exit_code == 5
+    assert name in result.output
+    assert "Traceback" not in result.output
+
+
+def test_validate_passes_what_we_write(folder: Path) -> None:
+    result = _beamline("validate", "scan.h5")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == ["scan.h5: 0 errors, 0 warnings"]
+
+
+def test_validate_names_each_fault(folder: Path) -> None:
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/sample/rotation_angle"][7] = np.nan
+        seal(file)
+    result = _beamline("validate", "scan.h5")
+    assert result.exit_code == 5
+    assert "error    angles" in result.stdout
+    assert "beamline: scan.h5: 1 error against" in result.stderr
+    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--json").stdout.splitlines()]
+    assert [event["event"] for event in events][-1] == "done"
+    assert events[-1]["error"] == 1
+    assert events[0]["rule"] == "angles"
+
+
+def test_the_fixtures_are_described(folder: Path, shared_data: Path) -> None:
+    for name in ("diad_k11-18014.nxs", "esrf_bm05_nxtomo_20x16x16.nx"):
+        result = _beamline("info", str(shared_data / "fixtures" / name))
+        assert result.exit_code == 0, result.output
+        assert "reconstructable" in result.stdout
+    assert "there is no beam in them" in result.stdout
+
+
+def _stack(folder: Path) -> Path:
+    data = SCAN.line_integrals().astype(np.float32)
+    data[3, 0, :] = -1.0
+    tifffile.imwrite(folder / "in.tif", data, photometric="minisblack")
+    np.savetxt(folder / "angles.txt", np.degrees(SCAN.angles))
+    return folder / "in.tif"
+
+
+def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
+    _stack(folder)
+    options = ("--angles", "angles.txt", "--quantity", "line-integrals", "--pixel-size-um", "500", "--no-data", "-1")
+    result = _beamline("ingest", "in.tif", "out.h5", *options, "--sample", "cylinders", "--energy-kev", "25")
+    assert result.exit_code == 0, result.output
+    assert "out.h5" in result.stdout
+    assert "18, 0 without a valid pixel" in result.stdout
+    with open_scan("out.h5") as source:
+        assert source.quantity == "line_integrals"
+        assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
+        np.testing.assert_allclose(source.angles, SCAN.angles)
+        np.testing.assert_array_equal(source.read([0, 17]), SCAN.line_integrals().astype(np.float32)[[0, 17]])
+
+
+def test_ingest_for_machines(folder: Path) -> None:
+    _stack(folder)
+    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
+    said = json.loads(result.stdout.splitlines()[-1])
+    assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
+
+
+@pytest.mark.parametrize("command", [("info", "no.h5"), ("validate", "text.h5"), ("ingest", "no.tif", "out.h5")])
+def test_a_failure_is_the_last_json_event(folder: Path, command: tuple[str, ...]) -> None:
+    (folder / "text.h5").write_text("no scan")
+    result = _beamline(*command, "--json")
+    assert result.exit_code == 5
+    last = json.loads(result.stdout.splitlines()[-1])
+    assert (last["event"], last.get("exit_code", 5)) == ("done" if command[0] == "validate" else "failed", 5)
+
+
+def test_ingest_says_how_far_it_is(folder: Path) -> None:
+    _stack(folder)
+    options = ("--angles", "angles.txt", "--quantity", "line-integrals")
+    events = [
+        json.loads(line) for line in _beamline("ingest", "in.tif", "a.h5", *options, "--json").stdout.splitlines()
+    ]
+    progress = [event for event in events if event["event"] == "progress"]
+    assert (progress[-1]["n"], progress[-1]["of"], progress[-1]["eta_s"]) == (18, 18, 0.0)
+    result = _beamline("ingest", "in.tif", "b.h5", *options)
+    assert "frames: 18/18" in result.stderr
+    assert "18/18" not in result.stdout
+
+
+def test_sigterm_leaves_no_part_of_an_ingest(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    _stack(folder)
+    monkeypatch.setattr("beamline.features.files.ingest.digest", interrupted)
+    before = {path.name for path in folder.iterdir()}
+    result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt")
+    assert result.exit_code == 130
+    assert {path.name for path in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("in.tif", "out.h5"), "angles"),
+        (("in.tif", "no/out.h5", "--angles", "angles.txt"), "does not exist"),
+        (("in.tif", "scan.h5", "--angles", "angles.txt"), "exists"),
+        (("missing.tif", "out.h5"), "missing.tif"),
+        (("in.tif", "out.h5", "--angles", "angles.txt", "--angle-rows", "0:99"), "0:99"),
+        (("angles.txt", "out.h5"), "angles.txt"),
+    ],
+)
+def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...], said: str) -> None:
+    _stack(folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    result = _beamline("ingest", *arguments)
+    assert result.exit_code == 5, result.output
+    assert said in result.stderr
+    assert "Traceback" not in result.output
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def _bare(folder: Path) -> None:
+    """stack.tif: five pages without angles; long.txt: nine angles for them."""
+    tifffile.imwrite(folder / "stack.tif", np.arange(5 * 4 * 6, dtype=np.uint16).reshape(5, 4, 6))
+    (folder / "long.txt").write_text("0\n0\n0\n10\n20\n30\n40\n40\n40\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--angles FILE (degrees, one a line)"),
+        (("--angles", "long.txt"), "--angle-rows A:B"),
+        (("--angles", "long.txt"), "--angle-rows 2:7 takes the 5 neighbours"),
+        (("--angles", "long.txt", "--angle-rows", "5"), "--angle-rows 5 is not of the form A:B"),
+        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 does not lie within the 9 angles"),
+        (("--angle-rows", "1:6"), "--angle-rows 1:6 needs angles to choose from: give --angles FILE."),
+        (("--angles", "none.txt"), "The angles in none.txt cannot be read (No such file or directory)."),
+        (("--flats", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
+        (("--darks", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),
+    ],
+)
+@pytest.mark.parametrize("command", ["info", "validate", "ingest", "recon"])
+def test_messages_speak_of_options_as_they_are_typed(
+    folder: Path, command: str, options: tuple[str, ...], said: str
+) -> None:
+    _bare(folder)
+    result = _beamline(command, "stack.tif", *(["out.h5"] if command == "ingest" else []), *options)
+    assert result.exit_code == (0 if command == "info" and not options else 5)
+    assert said in result.output
+    assert "angle_rows" not in result.output
+    assert "Errno" not in result.output
+
+
+@pytest.mark.parametrize("command", ["info", "validate"])
+def test_what_is_missing_is_asked_for_by_its_option(folder: Path, command: str) -> None:
+    _bare(folder)
+    said = _beamline(command, "stack.tif").stdout
+    assert "say --quantity counts, --quantity transmission or --quantity line-integrals." in said
+    said = _beamline(command, "stack.tif", "--quantity", "counts").stdout
+    assert "Counts without flats: give --flats FILE (or a folder). If the frames were divided" in said
+    assert "Counts without darks: give --darks FILE (or a folder). If the frames were divided" in said
+
+
+def test_validate_deep_names_damaged_frames(folder: Path) -> None:
+    good = _beamline("validate", "scan.h5", "--deep")
+    assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/instrument/detector/data"][9, 1, 1] ^= 1
+    result = _beamline("validate", "scan.h5", "--deep")
+    assert result.exit_code == 5
+    assert "error    checksums       1 of 22 frames differ" in result.stdout and ": 9. Look" in result.stdout
+    events = [json.loads(line) for line in _beamline("validate", "scan.h5", "--deep", "--json").stdout.splitlines()]
+    assert events[0]["stage"] == "validate" and {event["event"] for event in events} == {"progress", "flag", "done"}
+
+
+def test_escapes_in_the_texts_of_a_file_do_not_reach_the_terminal(folder: Path) -> None:
+    with h5py.File("scan.h5", "r+") as file:
+        file["entry/title"][()] = "a\x1b]0;owned\x07\x1b[2J"
+    for command in ("info", "validate"):
+        output = _beamline(command, "scan.h5").output
+        assert "\x1b" not in output and "\x07" not in output
+    assert "a\\x1b]0;owned" in _beamline("info", "scan.h5").stdout
+
+
+@pytest.mark.parametrize("command", ["info", "validate", "monitor"])
+def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command: str) -> None:
+    data = (folder / "scan.h5").read_bytes()
+    parts = data.split(b"EAIB")  # where HDF5 keeps the places of chunks
+    (folder / "scan.h5").write_bytes(b"EAIB".join([parts[0], *(part[:8] + b"?" + part[9:] for part in parts[1:])]))
+    result = _beamline(command, "scan.h5")
+    assert result.exit_code == 5, result.output
+    assert len(parts) > 1 and "damaged" in result.output
+
+
+def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:
+    scan = write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
+    result = CliRunner().invoke(main, ["info", str(scan), "--statistics", "-o", str(tmp_path / "h.png")])
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.stdout.splitlines()] == ["kind", "dark", "flat", "projection", "output"]
+    assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
+    for wrong in (["-o", "x.png"], ["--statistics", "--truth", "t.npy"]):
+        assert CliRunner().invoke(main, ["info", str(scan), *wrong]).exit_code == 2

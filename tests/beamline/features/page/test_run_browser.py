@@ -1,0 +1,171 @@
+"""Runs in the browser: their table, and the page of each below a number of the server's own."""
+
+import json
+import os
+import socket
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beamline.features.page import app, serve
+from beamline.features.page import run_browser as runs
+from beamline.page.run_files import EventLog
+from tests.beamline.features.page.served import Served, listed
+from tests.beamline.features.page.test_app import tile
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+SCAN = TwoCylinders()
+EVIL = "<img src=x>"
+
+
+def made(folder: Path, day: int, sample: str) -> Path:
+    """A run of a day, which was stopped before it had all its frames."""
+    run = folder / f"202601{day:02d}T120000Z_s"
+    run.mkdir()
+    events = (
+        {"event": "run_started", "time": 1.0, "sample": sample, "n_frames": 60},
+        {"event": "state", "time": 2.0, "state": "stopped"},
+    )
+    (run / "events.jsonl").write_text("".join(f"{json.dumps(event)}\n" for event in events))
+    write_flagged(run / "scan.h5", frames_of(SCAN), {})
+    return run
+
+
+def rows(page: Served) -> list[dict[str, Any]]:
+    return list(json.loads(page.ask("/api/runs")[2])["rows"])
+
+
+def test_the_table_is_that_of_the_terminal_newest_first(tmp_path: Path) -> None:
+    made(tmp_path, 1, "first")
+    with listed(tmp_path) as page:
+        (before,) = rows(page)
+        made(tmp_path, 2, EVIL)
+        newer, older = rows(page)
+    assert older == before  # its number stays, so that a link does
+    assert before["cells"][1:4] == ["first", "49 of 60", "stopped"]
+    assert newer["cells"][1] == EVIL
+    assert newer["number"] != older["number"]
+
+
+def test_each_run_has_its_page(tmp_path: Path) -> None:
+    folders = [made(tmp_path, day, f"sample {day}") for day in (1, 2, 3)]
+    with listed(tmp_path) as page:
+        for row, run in zip(rows(page), reversed(folders), strict=True):
+            root = f"/run/{row['number']}"
+            assert b"main.js" in page.ask(f"{root}/")[2]
+            assert json.loads(page.ask(f"{root}/api/facts")[2])["run"] == run.name
+            assert tile(page.ask(f"{root}/api/frame/10?corrected=0")[2])[1].shape == SCAN.shape
+
+
+def test_runs_beyond_those_that_stay_open_are_opened_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runs, "OPEN_RUNS", 1)
+    for day in (1, 2):
+        made(tmp_path, day, "s")
+    with listed(tmp_path) as page:
+        for _ in range(2):
+            for row in rows(page):
+                assert page.ask(f"/run/{row['number']}/api/facts")[0] == 200
+
+
+def test_a_page_of_a_run_has_the_same_rules(tmp_path: Path) -> None:
+    made(tmp_path, 1, "s")
+    with listed(tmp_path) as page:
+        (row,) = rows(page)
+        root = f"/run/{row['number']}"
+        for path in ("/", "/api/runs", f"{root}/", f"{root}/api/frame/0", f"{root}/api/feed"):
+            assert page.ask(path, token="")[0] == 403
+            assert page.ask(path, headers={"Host": "evil.example"})[0] == 421
+        headers = page.ask(f"{root}/api/facts")[1]
+        assert headers["content-security-policy"].startswith("default-src 'self'")
+        assert page.ask(f"{root}/api/verb/stop", "POST", headers={"Origin": f"http://{page.host}"})[0] == 403
+        for path in ("/run/7/api/facts", "/run/../api/facts/", "/run/x/", f"/run/%2e%2e/{tmp_path.name}/"):
+            assert page.ask(path)[0] == 404
+
+
+def test_a_folder_without_runs_has_an_empty_table(tmp_path: Path) -> None:
+    with listed(tmp_path) as page:
+        assert rows(page) == []
+
+
+SECRET = b"-----BEGIN PRIVATE KEY-----"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes take rights on Windows")
+def test_a_page_gives_out_what_lies_in_the_folders_of_runs_and_nothing_else(tmp_path: Path) -> None:
+    secret = made(tmp_path, 9, "private")
+    (secret / "recon.live.png").write_bytes(SECRET)
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    picture, piped, scan, log, part = (made(folder, day, f"run {day}") for day in (1, 2, 3, 4, 5))
+    (picture / "recon.live.png").symlink_to(secret / "recon.live.png")
+    os.mkfifo(piped / "recon.live.png")
+    os.mkfifo(piped / "recon.h5")
+    for run, name in ((scan, "scan.h5"), (log, "events.jsonl")):
+        (run / name).unlink()
+        (run / name).symlink_to(secret / name)
+    (part / "part-2").symlink_to(secret)
+    (folder / "20260106T120000Z_s").symlink_to(secret)
+    if os.geteuid() == 0:
+        os.chown(folder / "20260106T120000Z_s", 12345, 12345, follow_symlinks=False)
+    else:
+        (folder / "20260106T120000Z_s").unlink()
+    with listed(folder) as page:
+        found = rows(page)
+        assert [row["cells"][1] for row in found] == ["run 5", "run 3", "run 2", "run 1"]
+        for row in found:
+            root = f"/run/{row['number']}"
+            assert page.ask(f"{root}/api/model.png")[0] == 404
+            answers = [page.ask(f"{root}{path}") for path in ("/api/facts", "/api/frame/1", "/view/api/volumes")]
+            assert all(b"private" not in body and SECRET not in body for _, _, body in answers)
+            assert answers[0][0] == (404 if row["cells"][1] == "run 3" else 200)
+        (picture / "recon.live.png").unlink()
+        (picture / "recon.live.png").write_bytes(b"PNG")
+        assert page.ask(f"/run/{found[-1]['number']}/api/model.png")[2] == b"PNG"
+        for path in (
+            "/run/{}/",
+            "/run/0/api/frame/{}",
+            "/run/0/view/api/slice/{}/0/0",
+            "/run/0/view/api/profile/0/0/{}",
+        ):
+            assert page.ask(path.format("9" * 5000))[0] == 404
+        assert page.ask(f"/run/0/api/columns?first={'9' * 5000}", headers={"Last-Event-ID": "9" * 5000})[0] == 200
+
+
+@pytest.mark.slow
+def test_strangers_take_no_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serve, "TOKEN_WITHIN", 0.4)
+    monkeypatch.setattr(app, "MOST_STRANGERS", 30)
+    made(tmp_path, 1, "s")
+    with listed(tmp_path) as page, ExitStack() as opened:
+        host, port = page.host.split(":")
+        silent = [opened.enter_context(socket.create_connection((host, int(port)), 5)) for _ in range(250)]
+        assert page.ask("/api/runs")[0] == 200
+        for each in silent[-5:]:
+            with suppress(OSError):
+                each.send(b"GET / HTTP/1.1\r\nX: ")  # a request that never ends
+        began = time.monotonic()
+        for each in silent:
+            with suppress(ConnectionError):
+                assert each.recv(1) == b""
+        assert time.monotonic() - began < 2
+        assert page.ask("/api/runs")[0] == 200
+
+
+def test_a_log_is_read_without_its_bad_lines(tmp_path: Path) -> None:
+    good = [
+        '{"event": "state", "time": 1.0, "state": "darks", "message": "first"}',
+        '{"event": "warning", "time": 2.0}',
+    ]
+    bad = ['{"event": "frame", "time": 1.0, "n": "x"}', "[" * 100_000, "no JSON", '{"event": "state",\r"time": 1.0}']
+    (tmp_path / "events.jsonl").write_bytes("\n".join([good[0], *bad, good[1], good[0][:20]]).encode())
+    log = EventLog(tmp_path)
+    log.refresh()
+    assert (log.lines, log.skipped) == (good, len(bad))
+    with (tmp_path / "events.jsonl").open("ab") as file:
+        file.write(good[0][20:].encode() + b"\n")
+    log.refresh()
+    assert log.lines[2:] == [good[0]]

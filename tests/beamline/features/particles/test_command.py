@@ -1,0 +1,211 @@
+"""`beamline segment`: labels, table and picture; what a volume file says of its voxels; refusals."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import sys
+from dataclasses import replace
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.features.particles import run as segment_run
+from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from recon.base.volume import Grid, Volume
+from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.recon.post.phantom import BALLS, can
+
+VOXEL, CENTRE = 0.01, (0.5, -0.2, 0.3)  # mm
+WHOLE = [ball for ball in BALLS if ball[0][2] < 55]  # the others lie outside the square in the can
+MARGIN = ("--margin", "0.08")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest."""
+    monkeypatch.setattr(segment_run, "picture_of", lambda *_: b"")
+
+
+def _rows(path: Path) -> list[dict[str, float]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+
+
+@pytest.mark.usefixtures("real_pictures")
+def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> None:
+    data = can()
+    grid = Grid(data.shape, VOXEL, CENTRE)  # type: ignore[arg-type]
+    write_reconstruction(
+        here / "recon.h5",
+        ReconRecord(
+            volume=Volume(data, grid),
+            length_unit="mm",
+            raw_file="scan.h5",
+            title="t",
+            sample="s",
+            time=0.0,
+            parameters={},
+        ),
+    )
+    result = beamline("segment", "recon.h5", *MARGIN)
+    assert result.exit_code == 0, result.output
+    assert left(here) == {"recon.h5", "recon_particles.h5", "recon_particles.csv", "recon_particles.png"}
+    assert (here / "recon_particles.png").read_bytes().startswith(b"\x89PNG")
+    assert f"{len(WHOLE)}, 0 of them cut" in result.stdout
+    others = len(BALLS) - len(WHOLE)
+    assert f"left out    {others} bod{'y' if others == 1 else 'ies'} as bright outside the square" in result.stdout
+    rows = _rows(here / "recon_particles.csv")
+    assert [row["volume_mm3"] for row in rows] == sorted((row["volume_mm3"] for row in rows), reverse=True)
+    first = [axis[0] for axis in grid.coordinates()]
+    for centre, radius in WHOLE:
+        place = np.array(first) + np.array(centre) * VOXEL
+        places = np.array([[row["z_mm"], row["y_mm"], row["x_mm"]] for row in rows])
+        nearest = int(np.linalg.norm(places - place, axis=1).argmin())
+        row = rows[nearest]
+        np.testing.assert_allclose(places[nearest], place, atol=0.3 * VOXEL)
+        assert row["equivalent_diameter_mm"] == pytest.approx(2 * radius * VOXEL, rel=0.05)
+        assert row["volume_mm3"] == pytest.approx(np.pi / 6 * row["equivalent_diameter_mm"] ** 3, rel=1e-4)
+    with h5py.File(here / "recon_particles.h5") as file:
+        labels = file["entry/data/labels"]
+        (y0, y1), (x0, x1) = (
+            (np.searchsorted(axis, file[f"entry/data/{name}"][[0, -1]] - VOXEL / 2))
+            for name, axis in zip("yx", grid.coordinates()[1:], strict=True)
+        )
+        assert f"rows {y0}-{y1}, columns {x0}-{x1} of each slice" in result.stdout
+        z, y, x = (file[f"entry/data/{name}"][:] for name in "zyx")
+        assert labels.shape == (z.size, y.size, x.size)
+        for row in rows:
+            near = [int(np.abs(axis - row[f"{name}_mm"]).argmin()) for name, axis in zip("zyx", (z, y, x), strict=True)]
+            assert labels[tuple(near)] == row["label"]
+        assert file["entry/process/clusters"][()] >= 2
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn")
+def test_error_bars_in_the_file_give_each_volume_an_interval(here: Path) -> None:
+    data = can(noise=0.02)
+    record = ReconRecord(
+        volume=Volume(data, Grid(data.shape, VOXEL)),
+        length_unit="mm",
+        raw_file="scan.h5",
+        title="t",
+        sample="s",
+        time=0.0,
+        parameters={},
+    )  # type: ignore[arg-type]
+    rows = []
+    for deviation in (None, np.full_like(data, 0.05), np.full_like(data, 0.4)):
+        write_reconstruction(here / "v.h5", replace(record, deviation=deviation), replace=True)
+        assert beamline("segment", "v.h5", *MARGIN, "-o", "p.h5").exit_code == 0
+        rows.append(_rows(here / "p.csv"))
+        for name in ("p.h5", "p.csv", "p.png"):
+            (here / name).unlink()
+    without, sure, unsure = rows
+    assert "volume_low_mm3" not in without[0]
+    for a, b, c in zip(without, sure, unsure, strict=True):
+        assert a["volume_mm3"] == b["volume_mm3"] == c["volume_mm3"]
+        assert c["volume_low_mm3"] < b["volume_low_mm3"] < b["volume_mm3"] < b["volume_high_mm3"] < c["volume_high_mm3"]
+    true = sorted((4 / 3 * np.pi * (radius * VOXEL) ** 3 for _, radius in WHOLE), reverse=True)
+    within = [
+        row["volume_low_mm3"] <= volume <= row["volume_high_mm3"] for row, volume in zip(unsure, true, strict=True)
+    ]
+    assert sum(within) >= len(true) - 2
+
+
+def test_lengths_are_voxels_where_nobody_knows_them(here: Path) -> None:
+    np.save(here / "can.npy", can())
+    result = beamline("segment", "can.npy", *MARGIN, "-o", "a.h5", "--json")
+    assert result.exit_code == 0, result.output
+    done = json.loads(result.stdout.splitlines()[-1])
+    assert (done["event"], done["particles"], done["unit"]) == ("done", len(WHOLE), "px")
+    assert beamline("segment", "can.npy", *MARGIN, "--voxel-um", "10", "-o", "b.h5").exit_code == 0
+    px, mm = _rows(here / "a.csv"), _rows(here / "b.csv")
+    for one, other in zip(px, mm, strict=True):
+        assert one["volume_px3"] * 1e-6 == pytest.approx(other["volume_mm3"], rel=1e-5)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_touching_balls_are_one_without_a_neck(here: Path) -> None:
+    np.save(here / "can.npy", can())
+    result = beamline("segment", "can.npy", *MARGIN, "--neck", "0")
+    assert f"{len(WHOLE) - 1}, 0 of them cut" in result.stdout, result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("missing.h5",), 5, "no volume"),
+        (("even.npy",), 5, "cannot be segmented"),
+        (("holes.npy",), 5, "not finite"),
+        (("flat.npy",), 5, "expected real numbers"),
+        (("scan.h5",), 5, "is a scan"),
+        (("can.npy", "--percentiles", "90", "10"), 5, "rise"),
+        (("can.npy", "--clusters", "1"), 2, "--clusters"),
+        (("can.npy", "-o", "labels.csv"), 2, "labels.csv"),
+        (("can.npy", "-o", "can.npy"), 5, "never overwritten"),
+    ],
+)
+def test_bad_input_leaves_nothing(here: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
+    np.save(here / "can.npy", can()[:6])
+    np.save(here / "even.npy", np.ones((4, 5, 6)))
+    np.save(here / "holes.npy", np.full((4, 5, 6), np.nan))
+    np.save(here / "flat.npy", np.ones((5, 6)))
+    write_flagged(here / "scan.h5", frames_of(TwoCylinders()), {})
+    before = left(here)
+    result = beamline("segment", *arguments)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr and left(here) == before
+
+
+def test_a_picture_that_fails_leaves_nothing(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> bytes:
+        raise OSError(28, "No space left on device")
+
+    np.save(here / "can.npy", can())
+    monkeypatch.setattr(segment_run, "picture_of", full)
+    result = beamline("segment", "can.npy", *MARGIN)
+    assert result.exit_code == 5 and "No space left" in result.stderr
+    assert left(here) == {"can.npy"}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("napari") is not None, reason="napari is installed")
+def test_napari_that_is_not_there_is_refused_before_the_work(here: Path) -> None:
+    np.save(here / "can.npy", can())
+    result = beamline("segment", "can.npy", "--napari")
+    assert result.exit_code == 2 and "pip install" in result.stderr and left(here) == {"can.npy"}
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_napari_gets_the_volume_and_its_labels(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layers: dict[str, tuple[np.ndarray, tuple[float, ...]]] = {}
+
+    class Viewer:
+        def add_image(self, data: np.ndarray, scale: tuple[float, ...], name: str) -> None:
+            layers[name] = data, scale
+
+        add_labels = add_image
+
+    napari = ModuleType("napari")
+    napari.__spec__ = ModuleSpec("napari", None)
+    napari.__dict__.update(Viewer=Viewer, run=lambda: None)
+    monkeypatch.setitem(sys.modules, "napari", napari)
+    np.save(here / "can.npy", can())
+    result = beamline("segment", "can.npy", *MARGIN, "--voxel-um", "10", "--napari")
+    assert result.exit_code == 0, result.output
+    assert layers["particles"][0].max() == len(WHOLE)
+    assert layers["volume"][0].shape == layers["particles"][0].shape
+    assert layers["volume"][1] == layers["particles"][1] == (VOXEL,) * 3

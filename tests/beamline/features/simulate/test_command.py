@@ -1,0 +1,271 @@
+"""`beamline simulate`: the file is a scan like any other, labels and truth belong to it, and nothing half stays."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import struct
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.core.shipped import shipped_scenes
+from beamline.features.simulate import command as module
+from beamline.features.simulate import figure, write
+from beamline.features.simulate.scene import scan_of
+from beamline.scenes.scene_file import open_scene
+from beamline.storage.readers.open import open_scan
+from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from simulators.frame.shot import CannotExposeError
+from tests.beamline.simulate.read_labels import read_labels
+
+SCENE = """
+phantom:
+  kind: solids
+  solids:
+    - {kind: ellipsoid, semi_axes: [0.1, 0.08, 0.12], attenuation: 4.0, centre: [0.05, 0.02, 0.03]}
+    - {kind: cylinder, radius: 0.05, height: 0.2, attenuation: 2.0, centre: [-0.15, 0.0, 0.0]}
+beam: {photons_per_s: 1.0e+5}
+axis_offset_px: 1.5
+detector: {shape: [32, 40], pixel_size_um: 12.0, exposure_s: 0.02}
+scan: {views: 12, darks: 2, flats: 2}
+effects: [photon_noise, read_noise, offset]
+"""
+
+HUGE = ("--frames", "1000000", "--set", "detector.shape=[2304,4096]", "--set", "effects=[]")
+BAND = "{kind: black_band, width: 0.1, penumbra: 0.01}"
+FRINGES = "{kind: phase_fringes, delta_beta: 3000, distance: 1, energy: 20}"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.yaml").write_text(SCENE, encoding="utf-8")
+    return tmp_path
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, list(arguments))
+
+
+def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--frames", "6", "--seed", "4")
+    assert result.exit_code == 0, result.output
+    assert "10 frames" in result.stdout
+    assert "no anomaly" in result.stdout
+    assert Path("scan.png").read_bytes().startswith(b"\x89PNG")
+    assert read_labels(Path("scan.labels.json")) == ()
+    with open_scan("scan.h5") as source:
+        kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * 6
+        assert source.image_key.tolist() == kinds
+        np.testing.assert_allclose(np.degrees(source.angles[4:]), np.arange(6) * 30.0)
+        assert source.axis_col == 19.5 + 1.5
+        assert source.pixel_size_mm == pytest.approx(0.012)
+        frames = source.read(slice(None)).astype(float)
+    assert frames[:2].mean() == pytest.approx(200, abs=1)
+    assert frames[2:4].mean() == pytest.approx(200 + 2000 / 0.107, rel=0.01)
+    assert _beamline("validate", "scan.h5").exit_code == 0
+    again = _beamline("simulate", "scene.yaml", "--out", "again.h5", "--frames", "6", "--seed", "4")
+    assert again.exit_code == 0
+    with open_scan("again.h5") as source:
+        np.testing.assert_array_equal(source.read(slice(None)), frames)
+
+
+def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--truth", "truth.h5", "--truth-bin", "2")
+    assert result.exit_code == 0, result.output
+    grid = Grid.matching(Geometry.parallel([0.0], (32, 40), pixel_pitch=0.012, axis_col=21.0).binned(2))
+    with h5py.File("truth.h5") as file:
+        data, labels = file["entry/data/data"][...], file["entry/data/labels"][...]
+        assert file["entry/data/labels"].attrs["names"].tolist() == ["air", "ellipsoid", "cylinder"]
+        for name, centres in zip(("z", "y", "x"), grid.coordinates(), strict=True):
+            np.testing.assert_allclose(file[f"entry/data/{name}"], centres)
+    assert data.shape == labels.shape == grid.shape
+    # What the voxels hold is what the solids hold: 4/3 π a b c and π r² h.
+    masses = 4 / 3 * np.pi * 0.1 * 0.08 * 0.12 * 4.0, np.pi * 0.05**2 * 0.2 * 2.0
+    assert data.sum(dtype=float) * grid.voxel_size**3 == pytest.approx(sum(masses), rel=0.01)
+    assert (labels == 1).sum() * grid.voxel_size**3 == pytest.approx(masses[0] / 4.0, rel=0.03)
+
+
+def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--explain")
+    assert result.exit_code == 0, result.output
+    head, tail = result.stdout.split("Not named by the scene")
+    lines = [line.split()[0] for line in head.splitlines() if line]
+    steps = ["line_integrals", "beer_lambert", "photon_noise", "read_noise", "offset", "digitise"]
+    assert [line for line in lines if line in steps] == steps
+    assert "rolling_shutter" in tail
+    assert "photon_noise" not in tail
+    said = json.loads(_beamline("simulate", "scene.yaml", "--explain", "--json").stdout.splitlines()[0])
+    assert said["event"] == "explain"
+    assert [cost["name"] for cost in said["costs"]] == steps
+    assert said["ms"] > 0
+
+
+def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real, made = write.expose, []
+
+    def stopping(*arguments: object) -> object:
+        made.append(1)
+        if len(made) == 7:
+            signal.raise_signal(signal.SIGINT)
+        return real(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(write, "expose", stopping)
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5")
+    assert result.exit_code == 4
+    assert "Stopping after this frame. Ctrl-C again stops at once." in result.stderr
+    assert "Stopped after 7 of 16 frames; scan.h5 holds them and is readable." in result.stderr
+    with open_scan("scan.h5") as source:
+        assert source.image_key.size == 7
+        assert source.attributes["status"] == "stopped"
+    assert json.loads(Path("scan.labels.json").read_text(encoding="utf-8"))["frames"] == 7
+
+
+@pytest.mark.parametrize(
+    ("ends", "code"), [(KeyboardInterrupt(), 130), (CannotExposeError("too bright"), 2), (OSError(28, "full"), 5)]
+)
+def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, ends: BaseException, code: int
+) -> None:
+    real, made = write.expose, []
+
+    def ending(*arguments: object) -> object:
+        made.append(1)
+        if len(made) == 7:
+            raise ends
+        return real(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(write, "expose", ending)
+    result = _beamline("simulate", "scene.yaml", "--out", "scan.h5", "--json", "--set", f"effects=[{BAND}]")
+    assert result.exit_code == code
+    events = [json.loads(line)["event"] for line in result.stdout.splitlines()]
+    assert (events[-1], events.count("failed"), "done" in events) == ("failed", 1, False)
+    with open_scan("scan.h5") as source:
+        assert (source.image_key.size, source.attributes["status"]) == (6, "failed")
+    (run,) = read_labels(Path("scan.labels.json"))
+    assert (run.kind, run.first, run.last) == ("black_band", 2, 5)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there SIGTERM cannot be caught")
+def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(*arguments: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    before = sorted(path.name for path in folder.iterdir())
+    monkeypatch.setattr("beamline.scenes.truth.write_truth", asked)
+    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
+    assert result.exit_code == 130
+    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+def test_with_nothing_to_do_programs_are_told_too(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--json")
+    assert result.exit_code == 2
+    assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
+
+
+def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    for arguments, code, words in (
+        (("--out", "scan.h5", *HUGE), 5, r"scan.h5 would take 23\.4 TB with 1000004 frames, its disk has .* free"),
+        (("--truth", "t.h5", "--truth-bin", "1"), 2, r"--truth-bin 1: the truth takes 819 kB of memory, 300 kB are"),
+    ):
+        monkeypatch.setattr(module, "free_memory", lambda: 300_000)
+        result = _beamline("simulate", "scene.yaml", *arguments)
+        assert result.exit_code == code
+        assert re.search(words, result.stderr), result.stderr
+        assert sorted(path.name for path in folder.iterdir()) == before
+    assert _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
+
+
+@pytest.mark.usefixtures("real_pictures")
+@pytest.mark.parametrize("shape", ["1,300", "300,1", "1,1"])
+def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> None:
+    wanted = ("--picture", "p.png", "--truth", "t.h5", "--set", f"detector.shape=[{shape}]", "--frames", "1")
+    result = _beamline("simulate", "scene.yaml", *wanted)
+    assert result.exit_code == 0, result.output
+    width, height = struct.unpack(">II", Path("p.png").read_bytes()[16:24])
+    assert 100 <= height < 3 * width
+
+
+def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
+    scan = scan_of(open_scene("scene.yaml"), 0, 60, 0.0)
+    # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
+    assert figure._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
+    assert figure._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
+    assert figure._chosen(scan_of(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
+
+
+def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
+    result = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
+    assert result.exit_code == 2
+    assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
+    assert not Path("s.h5").exists()
+
+
+@pytest.mark.parametrize("output", ["--out", "--picture"])
+def test_no_truth_is_left_of_a_scene_that_cannot_be_exposed(folder: Path, output: str) -> None:
+    """The body is at the source in the first view alone, so that the rehearsal of the last one shows nothing."""
+    body = "{kind: ellipsoid, semi_axes: [0.1, 0.1, 0.1], attenuation: 4.0, centre: [0.0, -0.3, 0.0]}"
+    wrong = ("--set", "beam.sod=0.35", "--set", "beam.sdd=1", "--set", f"phantom.solids=[{body}]")
+    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", output, "s.h5", *wrong)
+    assert (result.exit_code, "reaches" in result.stderr) == (2, True), result.stderr
+    assert not Path("t.h5").exists()
+
+
+def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
+    wanted = ("--frames", "1", "--set", "beam.energy_kev=20.5")
+    assert _beamline("simulate", "scene.yaml", "--out", "s.h5", *wanted).exit_code == 0
+    with open_scan("s.h5") as source:
+        assert source.energy_kev == 20.5
+
+
+def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
+    made = _beamline("simulate", "scene.yaml", "--out", "s.h5", "--truth", "t.h5", "--truth-bin", "4")
+    assert "voxels of 0.048 mm, for `beamline recon --bin 4`" in made.stdout
+    shape = "--truth has shape (8, 10, 10), the volume (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
+    refused = _beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
+    assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("nowhere", "--explain"), 2, "There is no file nowhere, and scene 'nowhere' is unknown; legal: battery, "),
+        (("scene.yaml",), 2, "Nothing to do. Give --explain"),
+        (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
+        (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
+        (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
+        (("scene.yaml", "--out", "there.h5"), 5, "there.h5 exists"),
+        (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),
+        (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
+        (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),
+        (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Create it first"),
+        (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin needs --truth FILE"),
+        (("scene.yaml", "--out", "new.h5", "--seed", str(2**64)), 2, "--seed"),
+        (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
+    ],
+)
+def test_refused_before_anything_is_written(folder: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
+    Path("there.h5").write_bytes(b"")
+    Path("broken.yaml").write_text("phantom: {kind: solids, solids: []}\nbeam: {photons: 1}\n", encoding="utf-8")
+    before = sorted(path.name for path in folder.iterdir())
+    result = _beamline("simulate", *arguments)
+    assert (result.exit_code, words in result.stderr) == (code, True), result.stderr
+    assert sorted(path.name for path in folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_scenes() if name != "pet"])  # which emits
+def test_every_shipped_scene_can_be_simulated(folder: Path, name: str) -> None:
+    result = _beamline("simulate", name, "--frames", "1", "--picture", "p.png")
+    assert result.exit_code == 0, result.output

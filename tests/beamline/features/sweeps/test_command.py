@@ -1,0 +1,171 @@
+"""`beamline sweep`: a sheet and a table of one slice by each value, with a score that can be checked by hand."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.features.sweeps import sweep
+from beamline.features.sweeps.sheet import _changes_most
+from beamline.features.sweeps.sweep import HeldOutViews, SweptSlice, middle_axis, scores_of
+from beamline.projections.selection import Selection
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.voxels.direct import direct
+from recon.voxels.projector import Projector
+from tests.beamline.cli.small_scan import SCAN, beamline, left
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+PNG = b"\x89PNG"
+
+
+def _table(path: str = "scan_sweep.csv") -> list[dict[str, str]]:
+    with Path(path).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_score_is_what_a_volume_leaves_of_views_that_it_has_not_seen(folder: Path) -> None:
+    result = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7", "--air", "none", "--json")
+    assert result.exit_code == 0, result.output
+    assert left(folder) == {"scan.h5", "scan_sweep.png", "scan_sweep.csv"}
+    assert Path("scan_sweep.png").read_bytes().startswith(PNG)
+    done = json.loads(result.stdout.splitlines()[-1])
+    expected = {}
+    lines = SCAN.line_integrals().astype(np.float32)[:, :1]
+    held = np.unique((np.arange(3) + 0.5) * 30 // 3).astype(int)  # one of eight of 30
+    used = np.setdiff1d(np.arange(30), held)
+    geometry = Geometry.parallel(SCAN.angles, (1, 40), axis_col=20.7, pixel_pitch=0.5)
+    for name in ("ram-lak", "hann"):
+        views = geometry.select(used)
+        volume = direct(lines[used], views, Grid.matching(views), name)  # type: ignore[arg-type]
+        off = Projector(geometry.select(held), Grid.matching(views)).forward(volume) - lines[held]
+        expected[name] = np.sqrt((off**2).mean(axis=(1, 2))).mean() / np.sqrt((lines[held] ** 2).mean())
+    table = {row["filter"]: float(row["residual_held_out"]) for row in _table()}
+    assert table == pytest.approx(expected, rel=0.03)  # counts are whole numbers
+    assert done["scores"] == pytest.approx(list(table.values()), rel=1e-4)
+    assert done["best"] == {"filter": min(table, key=lambda name: table[name])}
+
+
+def test_the_axis_is_found_by_slices_of_fbp(folder: Path) -> None:
+    result = beamline("sweep", "scan.h5", "axis=17:24:0.5", "--json")
+    done = json.loads(result.stdout.splitlines()[-1])
+    assert float(done["best"]["axis"]) == pytest.approx(SCAN.axis_col, abs=0.3), result.stderr
+    result = beamline("sweep", "scan.h5", "axis=30:50:5", "-o", "outside.png")
+    assert result.exit_code == 2 and "outside the detector" in result.stderr
+
+
+def test_a_grid_of_two_options_finds_the_axis_with_a_method_that_explains_views(folder: Path) -> None:
+    given = ("sweep", "scan.h5", "axis=19.7:21.7:1", "iterations=5,15", "-m", "sirt", "-o", "grid.png")
+    planned = beamline(*given, "--dry-run")
+    assert planned.exit_code == 0 and "slices    6, each of 1 row by sirt" in planned.stdout
+    assert left(folder) == {"scan.h5"}
+    result = beamline(*given)
+    assert result.exit_code == 0, result.output
+    verdicts = {(row["axis"], row["iterations"]): row["verdict"] for row in _table("grid.csv")}
+    assert [at for at, verdict in verdicts.items() if verdict == "best"] == [("20.7", "15")]
+    assert "beamline recon scan.h5 -m sirt --axis=20.7 --iterations=15" in result.stderr
+    assert "The best iterations" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("scan.h5", "give a scan, and an option"),
+        ("rings=none,vo", "give a scan, and an option"),
+        ("scan.h5 ring=none,vo", "did you mean rings?"),
+        ("scan.h5 rings=none,voo", "did you mean vo?"),
+        ("scan.h5 tv-weight=1,2", "is of fista-tv, os-sirt-tv; give --method"),
+        ("scan.h5 filter=hann,ram-lak -m sirt", "filter changes nothing of a slice by sirt"),
+        ("scan.h5 rings=none,vo --rings vo", "--rings is swept"),
+        ("scan.h5 rings=none,vo --truth t.npz", "--truth is of a volume"),
+        ("scan.h5 allow-negative=no,yes -m sirt", "expected allow-negative=false,true"),
+        ("scan.h5 rings=none,vo -o sheet.pdf", "give a name such as sheet.png"),
+    ],
+)
+def test_nonsense_is_refused_at_once(folder: Path, words: str, why: str) -> None:
+    result = beamline("sweep", *words.split())
+    assert result.exit_code == 2 and why in " ".join(result.stderr.split())
+    assert left(folder) == {"scan.h5"}
+
+
+def test_nothing_is_overwritten(folder: Path) -> None:
+    (folder / "scan_sweep.csv").write_text("mine")
+    result = beamline("sweep", "scan.h5", "filter=hann,ram-lak")
+    assert result.exit_code == 5 and "scan_sweep.csv exists" in result.stderr
+    assert left(folder) == {"scan.h5", "scan_sweep.csv"}
+
+
+@pytest.mark.parametrize("slices", [0, 2])
+def test_an_interrupt_keeps_the_slices_that_are_done(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, slices: int
+) -> None:
+    original, calls = sweep.swept_slice, iter(range(9))
+
+    def interrupted(*args: Any) -> Any:
+        if next(calls) == slices:
+            raise KeyboardInterrupt
+        return original(*args)
+
+    monkeypatch.setattr(sweep, "swept_slice", interrupted)
+    result = beamline("sweep", "scan.h5", "filter=hann,ram-lak,shepp-logan")
+    if not slices:
+        assert result.exit_code == 130 and left(folder) == {"scan.h5"}
+        return
+    assert result.exit_code == 4 and "after 2 of 3 slices" in result.stderr
+    assert [row["filter"] for row in _table()] == ["hann", "ram-lak"]
+
+
+def test_other_pixels_have_no_score(folder: Path) -> None:
+    result = beamline("sweep", "scan.h5", "bin=1,2")
+    assert result.exit_code == 0 and "No score" in result.stderr
+    assert [row["residual_held_out"] for row in _table()] == ["", ""]
+
+
+def _slice(name: str, image: float, views: HeldOutViews) -> SweptSlice:
+    return SweptSlice({"rings": name}, np.zeros((2, 2), np.float32), 0.0, views, np.full((2, 1, 4), image, np.float32))
+
+
+def _views(value: float, ids: tuple[int, int] = (1, 5)) -> HeldOutViews:
+    class Views:
+        geometry = Geometry.parallel(np.array([0.0, 1.0]), (1, 4), axis_col=1.5, pixel_pitch=1.0)
+
+    return HeldOutViews(np.array(ids), np.full((2, 1, 4), value, np.float32), Views())  # type: ignore[arg-type]
+
+
+def test_a_correction_that_agrees_with_itself_alone_does_not_win() -> None:
+    """Two of three corrections give views of 1, and the third, which takes half of them away, predicts its own best."""
+    ones, half = _views(1.0), _views(0.5)
+    scores = scores_of([_slice("a", 1.02, ones), _slice("b", 1.01, replace(ones)), _slice("c", 0.5, half)])
+    assert scores is not None and not scores.corrected_alike
+    assert scores.means == pytest.approx(np.array([2 * 0.02 + 0.52, 2 * 0.01 + 0.51, 2 * 0.5 + 0.0]) / 2.5, rel=1e-5)
+    assert scores.best == 1
+
+
+def test_only_views_that_no_slice_has_learnt_from_count() -> None:
+    scores = scores_of([_slice("a", 1.5, _views(1.0)), _slice("b", 1.2, _views(1.0, (5, 9)))])
+    assert scores is not None and scores.residuals.shape == (2, 1) and scores.corrected_alike
+    assert scores_of([_slice("a", 1.5, _views(1.0)), _slice("b", 1.2, _views(1.0, (7, 9)))]) is None
+
+
+def test_views_are_corrected_about_the_middle_axis_where_it_is_swept() -> None:
+    def of(*axes: float | None) -> Iterator[Selection]:
+        return (Selection(axis_col=axis) for axis in axes)
+
+    assert middle_axis([*of(5.0, 3.0, 4.0)]) == 4.0
+    assert middle_axis([*of(5.0, 5.0)]) is None and middle_axis([*of(5.0, None)]) is None
+
+
+def test_the_part_that_changes_most_is_shown() -> None:
+    images = [np.zeros((300, 450), np.float32) for _ in range(2)]
+    images[1][220:240, 400:410] = 1
+    rows, cols = _changes_most(images)
+    assert (rows.stop - rows.start, cols.stop - cols.start) == (200, 200)
+    assert rows.start <= 220 and rows.stop >= 240 and cols.start <= 400 and cols.stop >= 410
+    assert _changes_most([image[:100, :100] for image in images]) == (slice(None), slice(None))

@@ -1,0 +1,211 @@
+"""A client of Tango reads a run, its pictures and its end, and ends it where it may."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.features.tango.device import ServerPlace, device_class, push_changes
+from beamline.features.tango.followed_run import FollowedRun
+from beamline.features.tango.values import ScanAttributes
+from beamline.scan.control import Verb
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.volumes.files import write_volume
+from tests.beamline.cli.small_scan import beamline
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+WITHIN = 60.0  # s
+
+
+def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tango", None)
+    with pytest.raises(ConfigError, match=r"splatline\[tango\]"), closing(FollowedRun(tmp_path, print)) as run:
+        device_class(run, control=False)
+
+
+def test_a_name_that_is_none_is_refused() -> None:
+    result = beamline("tango", "--device", "scan")
+    assert result.exit_code == 2 and "expected DOMAIN/FAMILY/MEMBER" in result.stderr
+
+
+def test_a_place_as_arguments_of_a_server() -> None:
+    assert ServerPlace("0.0.0.0", 1, "a/b/c").arguments[-1] == "giop:tcp::1"
+    assert ServerPlace("127.0.0.1", 1, "a/b/c", "id19").arguments[:2] == ["splatline", "id19"]
+    assert "-nodb" not in ServerPlace("127.0.0.1", 1, "a/b/c", "id19").arguments
+
+
+tango = pytest.importorskip("tango")
+
+
+@contextmanager
+def _signals_as_before() -> Iterator[None]:
+    """Tango takes the signals of its process for itself."""
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.getsignal(number))
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FollowedRun, Path, Any]]:
+    """The one device of this process, which Tango allows no second server; its folder of runs is empty at first."""
+    from tango.test_context import DeviceTestContext
+
+    runs = tmp_path_factory.mktemp("runs")
+    with (
+        closing(FollowedRun(runs, lambda line: None)) as run,
+        _signals_as_before(),
+        DeviceTestContext(device_class(run, control=True), process=False, debug=0) as device,
+    ):
+        yield run, runs, device
+
+
+def _write_run(runs: Path) -> TwoCylinders:
+    scan, folder = TwoCylinders(), runs / "2026-01-01T000000_a"
+    folder.mkdir()
+    write_flagged(folder / "scan.h5", frames_of(scan), {})
+    events = [
+        {"event": "run_started", "time": 1.7e9, "folder": "a", "path": "a/scan.h5", "sample": "s", "n_frames": 98},
+        {"event": "flag", "time": 1.7e9 + 1.25, "check": "beam", "level": "alarm", "frame": 3, "advice": "look"},
+        {"event": "state", "time": 1.7e9 + 2.5, "state": "failed", "message": "the stage does not answer"},
+    ]
+    (folder / "events.jsonl").write_text("".join(json.dumps(event) + "\n" for event in events), encoding="utf-8")
+    return scan
+
+
+def test_a_run_as_a_client_sees_it(served: tuple[FollowedRun, Path, Any]) -> None:
+    run, runs, device = served
+    run.look()
+    assert (device.state(), device.ScanStatus, device.SampleName) == (tango.DevState.ON, "idle", "")
+    assert device.read_attribute("LastView").quality == tango.AttrQuality.ATTR_INVALID
+    with pytest.raises(tango.DevFailed, match="There is no run"):
+        device.Stop()
+
+    scan = _write_run(runs)
+    run.look()
+    frames = frames_of(scan)
+    expected = {
+        "SampleName": ("s", 1.7e9, "VALID"), "ScanStatus": ("failed", 1.7e9 + 2.5, "VALID"),
+        "Alarms": (1, 1.7e9 + 1.25, "ALARM"), "FlagNames": (("beam",), 1.7e9 + 1.25, "VALID"),
+        "ImagesSaved": (49, frames[-1].time, "VALID"), "PercentComplete": (50.0, frames[-1].time, "VALID"),
+        "Angle": (pytest.approx(np.degrees(frames[-1].angle)), frames[-1].time, "VALID"),
+    }  # fmt: skip
+    for name, (value, at, quality) in expected.items():
+        read = device.read_attribute(name)
+        given = tuple(read.value) if isinstance(value, tuple) else read.value
+        assert (name, given, read.quality.name) == (name, value, f"ATTR_{quality}")
+        assert read.time.totime() == pytest.approx(at, abs=1e-5)
+    assert device.read_attribute("Beam").quality == tango.AttrQuality.ATTR_INVALID
+    assert device.state() == tango.DevState.FAULT and device.status() == "failed; the stage does not answer"
+    assert device.LastView.shape == frames[-1].counts.shape and np.isfinite(device.LastView).any()
+    assert device.read_attribute("Slice").quality == tango.AttrQuality.ATTR_INVALID
+    values, folder = np.arange(60, dtype=np.float32).reshape(3, 4, 5), runs / "2026-01-01T000000_a"
+    write_volume(folder / "recon.h5", bare_record(folder / "scan.h5", values))
+    assert np.array_equal(device.Slice, values[1])
+    with pytest.raises(tango.DevFailed, match="no scan runs"):
+        device.Abort()
+
+
+def test_only_what_was_set_again_is_pushed(tmp_path: Path) -> None:
+    pushed: dict[str, Any] = {}
+
+    class Recorder:
+        def push_change_event(self, name: str, value: Any, at: float, quality: Any) -> None:
+            pushed[name] = value, quality
+
+    with closing(FollowedRun(tmp_path, print, lambda: 100.0)) as run:
+        before = run.look()
+        push_changes(Recorder(), before, run.look())
+        assert pushed == {}
+        _write_run(tmp_path)
+        push_changes(Recorder(), before, run.look())
+    quality = tango.AttrQuality
+    assert pushed["SampleName"] == ("s", quality.ATTR_VALID) and pushed["FlagCounts"] == ([1], quality.ATTR_VALID)
+    assert pushed["State"] == (tango.DevState.FAULT, quality.ATTR_VALID) and pushed["Alarms"] == (1, quality.ATTR_ALARM)
+    assert "Beam" not in pushed and "Warnings" in pushed  # it was set to 0 by the start
+
+
+def test_verbs_are_commands_only_with_control(tmp_path: Path) -> None:
+    with closing(FollowedRun(tmp_path, print)) as run:
+        watching, controlling = (vars(device_class(run, control)) for control in (False, True))
+    verbs = {verb.value.capitalize() for verb in Verb}
+    assert not verbs & set(watching) and verbs <= set(controlling)
+    assert {each.metadata["attribute"] for each in fields(ScanAttributes)} <= set(watching)
+
+
+_EVENTS = """
+import json, sys, time
+import tango
+
+device, stored = tango.DeviceProxy(sys.argv[1]), []
+device.subscribe_event("ImagesSaved", tango.EventType.CHANGE_EVENT, lambda told: stored.append(told.attr_value.value))
+while len(stored) < 3:
+    time.sleep(0.1)
+print(json.dumps(stored[:3]), flush=True)
+"""
+"""Waits for events; a process of its own, which may end as it likes."""
+
+
+@pytest.mark.slow
+def test_a_simulated_scan_is_paused_resumed_and_stopped_beside_a_real_server(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "beamline.cli.main"]
+    server = [*command, "tango", str(tmp_path), "--control", "--port", str(port)]
+    scan = [
+        *command, "scan", "configs/simulated.yaml", "--no-live", "-o", str(tmp_path), "--set", "scan.period_s=0.2",
+        "--set", "scan.angles.views=2000",
+    ]  # fmt: skip
+
+    def until(met: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + WITHIN
+        while not met():
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+
+    with subprocess.Popen(server, stdout=subprocess.DEVNULL) as serving:
+        name = f"tango://127.0.0.1:{port}/splatline/scan/1#dbase=no"
+        device = tango.DeviceProxy(name)
+
+        def answers() -> bool:
+            try:
+                return bool(device.ping())
+            except tango.DevFailed:
+                return False
+
+        until(answers)
+        with subprocess.Popen(scan, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as scanning:
+            until(lambda: device.ScanStatus == "acquiring" and device.ImagesSaved > 6)
+            told = subprocess.run(
+                [sys.executable, "-c", _EVENTS, name], stdout=subprocess.PIPE, text=True, timeout=WITHIN
+            )
+            stored = json.loads(told.stdout)
+            assert len(stored) == 3 and stored == sorted(stored)
+            assert device.state() == tango.DevState.RUNNING and device.ImagesPlanned > 2000
+            assert device.LastView.shape == (144, 160)
+            device.Pause()
+            until(lambda: device.state() == tango.DevState.STANDBY)
+            device.Resume()
+            until(lambda: device.state() == tango.DevState.RUNNING)
+            device.Stop()
+            assert scanning.wait(WITHIN) == 4
+        until(lambda: device.ScanStatus == "stopped")
+        second = subprocess.run(server, capture_output=True, text=True, timeout=WITHIN)  # an ORB of its own
+        assert second.returncode == 5 and "the port is taken" in second.stderr
+        serving.terminate() if sys.platform == "win32" else serving.send_signal(2)
+        assert serving.wait(WITHIN) == 0

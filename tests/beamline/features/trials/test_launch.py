@@ -1,0 +1,81 @@
+"""A trial's process: what becomes of it whatever ends it, what it is told, and that its memory is its own."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.features.trials import launch as trial_run
+from beamline.features.trials.data import TrialData
+from beamline.features.trials.launch import compile_kernels, run_trial
+from beamline.features.trials.plans import plan
+from beamline.features.trials.trial import Trial
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from tests.beamline.scans import TwoCylinders
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+@pytest.mark.parametrize(
+    ("program", "limit", "status", "said"),
+    [
+        ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
+        ("import sys; sys.exit('it broke')", None, "failed", "it broke"),
+        ('print(\'{"event": "failed", "message": "no matter"}\')', None, "failed", "no matter"),
+        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5, "curve": [[1, 2]]}\')', 60.0, "done", ""),
+    ],
+)
+def test_what_becomes_of_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float | None, status: str, said: str
+) -> None:
+    def fake(job: Path) -> Sequence[str]:
+        return [sys.executable, "-c", program]
+
+    monkeypatch.setattr(trial_run, "command", fake)
+    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
+    assert (outcome.status, said in outcome.message) == (status, True)
+    assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
+
+
+def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = 'import sys; print(\'{"event": "failed", "message": "v.npy: the disk is full"}\'); sys.exit(5)'
+    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", program])
+    with pytest.raises(DataError, match=r"v\.npy:"):
+        run_trial(Trial("method", "fbp", 10), tmp_path, 0)
+
+
+def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
+    out = tmp_path / "seen.json"
+    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
+    compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
+    job = json.loads(out.read_text())
+    words = ("start", "fit.loss", "fit.kernel")
+    kinds = [(trial["method"], *(trial["settings"].get(name, "") for name in words)) for trial in job["compile"]]
+    assert sorted(kinds) == [
+        ("fbp", "", "", ""), ("r2", "", "", ""), ("r2", "", "", "gaussian"), ("r2", "", "l2", ""),
+        ("r2", "", "poisson", ""), ("r2", "tv", "", ""), ("sirt", "", "", ""),
+    ]  # fmt: skip
+    assert job["data"] == str(tmp_path / "data")  # whose geometry decides which kernels are used
+
+
+@pytest.mark.slow
+def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
+    """Its memory is its own: this process, which has more, does not show in it."""
+    views = Geometry.parallel(SCAN.angles, SCAN.shape)
+    data = TrialData(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
+    data.save(tmp_path / "data")
+    ballast = np.ones(90_000_000)  # 720 MB
+    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
+    assert outcome.status == "done", outcome.message
+    assert outcome.quality("psnr") > 20
+    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes

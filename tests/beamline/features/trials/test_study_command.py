@@ -1,0 +1,202 @@
+"""`beamline study`: the table and its figures, rows that are left out, what an interruption leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from beamline.cli.main import main
+from beamline.features.trials import runner
+from beamline.features.trials.data import TrialData
+from beamline.features.trials.launch import DATA
+from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.worker import measured
+from beamline.report.slice_sheet import SliceSheet
+from recon.base.volume import Grid
+from tests.beamline.html_page import parsed_page
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 1.875)), shape=(4, 40))  # 96 views
+ERROR = 1e-3  # 1/mm, of every voxel that a row reconstructs
+
+
+def _beamline(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["study", *arguments])
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
+    """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
+    found: list[tuple[Trial, TrialData]] = []
+
+    def trial(trial: Trial, work: Path, seed: int, limit: float | None, *, keep: Path) -> Outcome:
+        data = TrialData.load(work / DATA)
+        grid = Grid.matching(data.geometry)
+        truth = SCAN.truth(grid)
+        figures, _ = measured(lambda key: truth + np.float32(ERROR) if found else truth, data, grid, keep)
+        assert trial.choice is not None
+        lines, geometry, _ = data.chosen(trial.choice)
+        found.append((trial, replace(data, projections=lines, geometry=geometry)))
+        reached = "" if trial.seconds_asked is None else "7 iterations"
+        return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0, reached=reached)
+
+    monkeypatch.setattr(runner, "run_trial", trial)
+    monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)
+    return found
+
+
+def _rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "study.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    truth = SCAN.truth(Grid((4, 40, 40)))
+    np.save(folder / "truth.npy", truth)
+    light = "--photons-per-count", "0.5"
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp", *light)
+    assert result.exit_code == 0, result.output
+    rows = _rows(folder / "many_fixed-views")
+    assert [(row["views"], row["status"]) for row in rows] == [
+        ("0", "not run"), ("0", "not run"), ("90", "done"), ("45", "done"),
+    ]  # fmt: skip
+    assert "asks for 360 views" in rows[0]["message"] and "fixed, 360 views is left out" in result.stderr
+    peak = 20 * np.log10(truth.max() / ERROR)
+    inside = truth[:, 8:32, 8:32]  # the square in the circle, less a tenth on each side
+    dense, empty = inside[inside > 0.045], inside[inside <= 0.045]  # the core; body and air differ less
+    for row in rows[2:]:
+        figures = {
+            name: float(row[name]) for name in ("psnr_fbp", "psnr_truth", "ssim_fbp", "ssim_truth", "snr", "cnr")
+        }
+        assert figures["psnr_fbp"] == pytest.approx(peak, abs=1e-3) == figures["psnr_truth"]
+        assert figures["ssim_fbp"] == pytest.approx(figures["ssim_truth"]) and 0 < figures["ssim_truth"] < 1
+        assert figures["snr"] == pytest.approx(20 * np.log10((dense.mean() + ERROR) / empty.std()), abs=1e-3)
+        assert figures["cnr"] == pytest.approx(20 * np.log10((dense.mean() - empty.mean()) / empty.std()), abs=1e-3)
+    first, *others = seen
+    assert first[0].settings == {"filter": "shepp-logan"} and first[1].geometry.n_views == 96
+    assert [data.geometry.n_views for _, data in others] == [90, 45]
+    left = {path.name for path in (folder / "many_fixed-views").iterdir()}
+    assert left == {"study.csv", "study.json", "report.html", "figures.png", "cost.png", "slices_fbp.png"}
+    assert [row["frames"] for row in rows[2:]] == ["90", "45"]
+    page = parsed_page((folder / "many_fixed-views" / "report.html").read_text(encoding="utf-8"))
+    assert float(rows[2]["photons"]) == pytest.approx(2 * float(rows[3]["photons"]))
+    assert any("photons a pixel and view" in text for text in page.text)
+    assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
+
+
+def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    methods = ("-m", "r2", "-m", "sirt", "-m", "fbp")
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", *methods, "--steps", "50", "--iterations", "7")
+    assert result.exit_code == 0, result.output
+    settings = {trial.method: trial.settings for trial, _ in seen[1:]}
+    assert settings == {"r2": {"steps": 50}, "sirt": {"iterations": 7}, "fbp": {}}
+    assert "r2: steps 50." in result.stdout and "sirt: iterations 7." in result.stdout
+    assert (folder / result.stdout.split()[-1]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_in_equal_time_the_table_says_what_was_asked_what_it_took_and_how_far_each_came(
+    folder: Path, seen: list[Any]
+) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "sirt", "-m", "fbp", "--seconds", "3")
+    assert result.exit_code == 0, result.output
+    assert [trial.seconds_asked for trial, _ in seen] == [None] + 2 * [3.0, None]
+    assert "Each row had 3 s" in result.stdout and "s asked" in result.stdout and "7 iterations" in result.stdout
+    rows = [row for row in _rows(folder / "many_fixed-views") if row["status"] == "done"]
+    assert [(row["seconds_asked"], row["seconds"], row["reached"]) for row in rows] == 2 * [
+        ("3.0", "2.0", "7 iterations"), ("", "2.0", "")
+    ]  # fmt: skip
+
+
+def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 0.5)), shape=(2, 40)))
+    result = _beamline("window-average", "many.h5", "--axis", "20.7", "-m", "fbp", "--json")
+    assert result.exit_code == 0, result.output
+    whole, *rows = (data for _, data in seen)
+    mean = rows[3]  # after three of single views: two views side by side
+    assert mean.geometry.n_views == 180
+    light = np.exp(-whole.projections.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
+    np.testing.assert_allclose(mean.projections, -np.log(light), atol=1e-5)
+    np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("study_started", "done", len(rows))
+
+
+def test_ctrl_c_leaves_the_rows_done_and_says_so(
+    folder: Path, seen: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    trial = runner.run_trial
+
+    def interrupted(*arguments: Any, **named: Any) -> Outcome:
+        if len(seen) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return trial(*arguments, **named)
+
+    monkeypatch.setattr(runner, "run_trial", interrupted)
+    result = _beamline("random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")
+    assert result.exit_code == 4, result.output
+    assert "stopped after 2 of 6 rows" in result.stderr and "interrupted" in result.stdout
+    done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
+    assert done == ["fixed, 90 views", "random, 90 views, draw 1"]
+    assert (folder / "out" / "report.html").is_file() and not (folder / "out" / "work").exists()
+
+
+def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
+    volume = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
+    slices = SliceSheet()
+    slices.add("FBP of all views", volume)
+    for method in ("r2", "fbp"):
+        for draw in (1, 2):
+            slices.add(f"random, draw {draw}: {method}", volume, "random", method)
+        slices.add(f"fixed: {method}", volume, "", method)
+    for method in ("r2", "fbp"):
+        assert slices.labels(method) == ["FBP of all views", f"random, draw 1: {method}", f"fixed: {method}"]
+    assert slices.png(slices.labels("r2")).startswith(b"\x89PNG")
+
+
+def test_a_dry_run_names_the_rows_that_the_scan_has_and_writes_nothing(folder: Path, seen: list[Any]) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "--dry-run")
+    assert result.exit_code == 0, result.output
+    rows = [line.rsplit(None, 2)[0] for line in result.stdout.splitlines() if ": fbp" in line]
+    assert rows == ["FBP of all views: fbp", "fixed, 90 views: fbp", "fixed, 45 views: fbp"]
+    assert "fixed, 180 views is left out" in result.stderr
+    assert not seen and not (folder / "many_fixed-views").exists()
+
+
+def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_exchange(folder / "many.h5", SCAN)
+    monkeypatch.setattr(runner, "run_trial", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    result = _beamline("random", "many.h5", "--axis", "20.7", "-o", "out")
+    assert result.exit_code == 130, result.output
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("magic", "scan.h5"), 2, "magic"),
+        (("sector", "scan.h5", "-m", "magic"), 2, "magic"),
+        (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
+        (("sector", "scan.h5", "-o", "."), 5, "never overwritten"),
+        (("sector", "scan.h5", "-m", "fbp", "--steps", "5"), 2, "no row is by one of these"),
+        (("sector", "scan.h5", "--seconds", "3", "--steps", "5"), 2, "--steps does not go with --seconds"),
+        (("fixed-views", "scan.h5"), 5, "30 views are too few"),
+    ],
+)
+def test_bad_input_leaves_nothing(folder: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
+    result = _beamline(*arguments)
+    assert result.exit_code == code, result.output
+    assert said in result.stderr and result.stdout == ""
+    assert {p.name for p in folder.iterdir()} == {"scan.h5"}

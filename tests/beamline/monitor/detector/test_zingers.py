@@ -1,0 +1,79 @@
+"""Spots of single frames are counted; hot pixels, bright gaps that stay, edges and noise are none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.detector.zingers import VIEWS, ZingersCheck
+from beamline.monitor.digest import digest
+from beamline.monitor.spots import Spots, spots_of
+from drivers.base.frame import Frame
+
+SATURATION, BIN = 65535, 4
+
+
+def spots(frame: Frame, before: Frame) -> Spots:
+    return spots_of(frame, digest(frame.counts, SATURATION, BIN), digest(before.counts, SATURATION, BIN), None, 65535)
+
+
+def struck(frame: Frame, n: int, charge: int, rng: np.random.Generator) -> None:
+    """Adds n spots of one pixel, in preview blocks of their own."""
+    rows, cols = frame.counts.shape[0] // BIN, frame.counts.shape[1] // BIN
+    for at in rng.choice(rows * cols, n, replace=False):
+        row, col = BIN * (at // cols) + rng.integers(BIN), BIN * (at % cols) + rng.integers(BIN)
+        frame.counts[row, col] = min(int(frame.counts[row, col]) + charge, SATURATION)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 40])
+@pytest.mark.parametrize("charge", [20_000, 60_000])
+def test_every_spot_is_counted_with_its_saturated_pixels(
+    fake: Any, n: int, charge: int, rng: np.random.Generator
+) -> None:
+    before, frame = fake.views(2)
+    struck(frame, n, charge, rng)
+    saturated = int((frame.counts == SATURATION).sum())
+    assert spots(frame, before) == Spots(n, saturated)
+
+
+def test_what_stays_is_none(fake: Any, rng: np.random.Generator) -> None:
+    before, frame = fake.views(2)
+    for each in (before, frame):
+        each.counts[10, 20] = each.counts[31, 50] = 60_000  # hot
+        each.counts[:, 70:72] = 30_000  # a gap
+    assert spots(frame, before).n == 0
+
+
+def test_few_photons_are_none(rng: np.random.Generator, fake: Any) -> None:
+    before, frame = fake.views(2)
+    for each in (before, frame):
+        each.counts[:] = 200 + 40 * rng.poisson(5, each.counts.shape)
+    assert spots(frame, before).n == 0
+
+
+def only(fake: Any, frames: Sequence[Frame]) -> list[Flag]:
+    return [flag for flag in fake.flags(frames) if flag.check in ("zingers", "saturation")]
+
+
+def test_they_are_said_once_and_warned_of_where_there_are_many_and_never_saturation(
+    fake: Any, rng: np.random.Generator
+) -> None:
+    limit = ZingersCheck().warn * 64 * 96  # less than one
+    frames = fake.references() + fake.views(VIEWS + 3)
+    struck(frames[-2], 30, 60_000, rng)
+    flags = only(fake, frames)
+    assert [(flag.check, flag.level, flag.frame) for flag in flags] == [("zingers", Level.WARN, len(frames) - 2)]
+    assert flags[0].score == pytest.approx(30 / (64 * 96)) and limit < 1
+
+
+def test_a_few_are_a_fact(fake: Any, rng: np.random.Generator) -> None:
+    frames = fake.references() + fake.views(VIEWS + 5)
+    struck(frames[14], 2, 20_000, rng)
+    struck(frames[19], 3, 20_000, rng)
+    flags = fake.flags(frames, checks=[ZingersCheck(warn=1.0)])
+    assert [(flag.level, flag.frame) for flag in flags] == [(Level.INFO, 9 + VIEWS)]
+    assert flags[0].score == pytest.approx(5 / VIEWS / (64 * 96)) and "have 5 bright spots" in flags[0].advice

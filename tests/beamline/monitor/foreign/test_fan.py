@@ -1,0 +1,61 @@
+"""The filters see what is faster than the sample, and neither what turns with it, nor rings, nor the beam."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.monitor.foreign.fan import REACH, Clutter, correlate, covariance, filters, window
+
+LAGS = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
+CLUTTER = Clutter(speed=0.25, structure=1.0, common=4e-4, noise=2.5e-5)
+VIEWS, COLS = window(LAGS)
+
+
+def moving(speed: float, size: float = 0.75) -> np.ndarray:
+    return np.exp(-0.5 * ((COLS - speed * VIEWS) / size) ** 2)
+
+
+SPEEDS = np.array([-0.9, 0.9, 1e3])
+MADE = filters(LAGS, CLUTTER, np.array([moving(speed) for speed in SPEEDS]), SPEEDS)
+
+
+def outputs(pattern: np.ndarray) -> np.ndarray:
+    """Of the filters in the middle of a window, in standard deviations of clutter and noise as assumed."""
+    return np.einsum("slt,lt->s", MADE.weights, pattern.reshape(len(LAGS), -1))
+
+
+def test_the_covariance_is_one() -> None:
+    matrix = covariance(LAGS, CLUTTER)
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert np.linalg.eigvalsh(matrix).min() >= 0.99 * CLUTTER.noise
+    np.testing.assert_allclose(np.diag(matrix), CLUTTER.structure + 1 + CLUTTER.common + CLUTTER.noise, rtol=1e-6)
+
+
+def test_the_output_has_the_variance_one_on_clutter_and_its_strength_on_the_signal() -> None:
+    flat = MADE.weights.reshape(3, -1).astype(float)
+    np.testing.assert_allclose(np.einsum("sp,pq,sq->s", flat, covariance(LAGS, CLUTTER), flat), 1, rtol=1e-2)
+    np.testing.assert_allclose([outputs(moving(s))[i] for i, s in enumerate(SPEEDS)], MADE.strength, rtol=1e-3)
+
+
+@pytest.mark.parametrize("pattern", ["still", "slow", "ring", "beam"])
+def test_what_turns_stays_or_flickers_is_not_seen(pattern: str) -> None:
+    crumb = outputs(0.05 * moving(0.9))[1]
+    assert crumb > 5
+    seen = {
+        "still": 0.05 * moving(0.0, 2.0),
+        "slow": 0.05 * moving(0.2, 2.0),
+        "ring": np.tile(np.eye(2 * REACH + 1)[REACH], len(LAGS)) * 0.5,
+        "beam": 0.02 * np.isin(VIEWS, [0.0]),
+    }[pattern]
+    assert np.abs(outputs(seen)).max() < 0.25 * crumb
+
+
+def test_correlate_is_the_sum_over_the_window_and_goes_on_at_the_edges() -> None:
+    rng = np.random.default_rng(1)
+    views = rng.normal(size=(len(LAGS), 3, 20)).astype(np.float32)
+    found = np.empty((3, 3, 20), np.float32)
+    correlate(views, MADE.weights, found)
+    wide = np.pad(views, ((0, 0), (0, 0), (REACH, REACH)), mode="edge")
+    places = np.lib.stride_tricks.sliding_window_view(wide, 2 * REACH + 1, axis=2)
+    np.testing.assert_allclose(found, np.einsum("slt,lrct->src", MADE.weights, places), rtol=1e-3, atol=1e-2)

@@ -1,0 +1,117 @@
+"""--calibrate: places of views and the axis are learnt from a scan's own views, and enter the geometry alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.monitor.digest import digest
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.calibration.calibrate import Calibrate
+from beamline.projections.corrections.poses import PosesOfFile
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.protocols import PrepStep
+from beamline.projections.selection import Selection
+from beamline.storage.pose_table import read_poses
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
+from recon.base.geometry import Geometry
+from recon.features.calibration.freedom import knowable
+from tests.recon.features.calibration.bodies import balls
+
+N, SHAPE, PITCH, AXIS = 48, (24, 48), 0.5, 23.9
+JUMP = np.outer(np.arange(N) >= 20, (2.5, -1.5))
+LEARN = Calibrate(("axis", "shifts"))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Counts of balls that jump, in pixels of half a millimetre."""
+    path = tmp_path_factory.mktemp("calibrate") / "scan.h5"
+    geometry = Geometry.parallel(
+        np.linspace(0, np.pi, N, endpoint=False), SHAPE, pixel_pitch=PITCH, axis_col=AXIS, shifts=JUMP
+    )
+    counts = 100 + 40_000 * np.exp(-balls(10, 12).views(geometry))
+    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
+    angles = [np.nan] * 4 + geometry.angles.tolist()
+    with NXtomoWriter(path, ScanInfo("jump", pixel_size_mm=PITCH), SHAPE, clock=SystemClock()) as writer:
+        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
+            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
+            writer.append(frame, digest(frame.counts), [])
+    return path
+
+
+def prepared(path: Path, *steps: PrepStep, **selected: object) -> PreparedProjections:
+    asked: dict[str, Any] = {"axis_col": AXIS + 0.8, "steps": (Air("none"), *steps), **selected}
+    chosen = Selection(**asked)
+    with SourceOptions(path).open() as source:
+        return prepare_projections(source, chosen, lambda _: None)
+
+
+def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path) -> None:
+    found, plain = prepared(scan, LEARN), prepared(scan)
+    np.testing.assert_array_equal(found.projections.data, plain.projections.data)
+    rest, axis = knowable(found.geometry.shifts - JUMP, found.geometry.angles)
+    assert np.sqrt(np.mean(rest**2)) < 0.1
+    assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
+    done = found.done["calibrate"]
+    assert (
+        done.sentence.startswith("Geometry learnt: the axis moves by +")
+        and "Views held out deviate by" in done.sentence
+    )
+    assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
+    assert plain.done["calibrate"].sentence == ""
+
+
+def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
+    """With binning, shifts count in binned pixels; views held out are put in their places, too."""
+    found = prepared(scan, LEARN, binning=2, views="every:2", rows=(2, 22))
+    assert found.geometry.detector_shape == (10, 24) and found.geometry.n_views == N // 2
+    rest, _ = knowable(found.geometry.shifts - JUMP[::2] / 2, found.geometry.angles)
+    assert np.sqrt(np.mean(rest**2)) < 0.1
+    assert found.held_out is not None and found.held_out[1].shifts.any()
+
+
+def test_rows_around_a_region_are_placed_as_the_whole_scan_is(scan: Path) -> None:
+    whole = prepared(scan, LEARN)
+    near = prepared(scan, LEARN, rows=(2, 10), axis_rows=(0, 24))
+    np.testing.assert_array_equal(near.geometry.shifts, whole.geometry.shifts)
+    assert near.geometry.axis_col == whole.geometry.axis_col
+
+
+@pytest.mark.parametrize(("off", "given", "told"), [(0.0, None, False), (2.0, None, True), (2.0, AXIS, False)])
+def test_poses_of_a_volume_with_another_axis_are_told(
+    scan: Path, tmp_path: Path, off: float, given: float | None, told: bool
+) -> None:
+    rows = "\n".join(f"{view},{col},{row}" for view, (col, row) in enumerate(JUMP))
+    (tmp_path / "poses.csv").write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
+    warnings: list[str] = []
+    table = read_poses(str(tmp_path / "poses.csv"))
+    with SourceOptions(scan).open() as source:
+
+        def axis_of(known: float | None) -> float:
+            steps = Air("none"), PosesOfFile(replace(table, axis_col=known))
+            return prepare_projections(source, Selection(axis_col=given, steps=steps), warnings.append).axis_col
+
+        axis_of(axis_of(None) + off)
+    assert any("go with the rotation axis of that volume" in each for each in warnings) is told
+
+
+def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Path) -> None:
+    assert "it needs all views" in LEARN.needs_finished and Calibrate().needs_finished == ""
+    table = tmp_path / "poses.csv"
+    rows = "\n".join(f"{view},1,0" for view in range(N))
+    table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
+    with pytest.raises(ConfigError, match=r"--calibrate learns what .*give one of"):
+        prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
+    with pytest.raises(ValueError, match="'lean'"):
+        Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")

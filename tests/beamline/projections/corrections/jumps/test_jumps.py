@@ -1,0 +1,113 @@
+"""Views after a jump of the sample are corrected by shifts, or left out, and the reason is told in a line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.digest import digest
+from beamline.monitor.motion import MotionCheck
+from beamline.monitor.opposite import OppositeCheck
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.jumps.jumps import Jumps
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
+from tests.recon.voxels.balls import ball_views
+
+SHAPE = (8, 48)
+ANGLES = np.radians(np.arange(0, 180, 3.0))
+JUMP, FIRST = 41, 4  # view; row of the first view: two darks, two flats
+LATER = np.arange(ANGLES.size) >= JUMP
+SELECTION = Selection(axis_col=23.5, steps=(Air("none"),))
+
+
+def scan(path: Path, views: NDArray[np.float32], *jumps: int) -> Path:
+    counts = 100 + 40_000 * np.exp(-views) + np.random.default_rng(0).normal(0, 40, views.shape)
+    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * len(views)
+    angles = [np.nan] * 4 + ANGLES.tolist()
+    rows = {FIRST + view for view in jumps}
+    with NXtomoWriter(path / "scan.h5", ScanInfo("jump", pixel_size_mm=1.0), SHAPE, clock=SystemClock()) as writer:
+        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
+            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
+            said = [Flag(MotionCheck.name, Level.ALARM, i, 1.0, 0.5, "")] if i in rows else []
+            said += [Flag(OppositeCheck.name, Level.WARN, i, 1.0, 0.5, "")] if i - 3 in rows else []
+            writer.append(frame, digest(frame.counts), said)
+    return path / "scan.h5"
+
+
+def prepared(path: Path, selection: Selection = SELECTION) -> tuple[PreparedProjections, str]:
+    told: list[str] = []
+    with SourceOptions(path).open() as source:
+        return prepare_projections(source, selection, told.append), " ".join(told)
+
+
+def moved(x: float, z: float) -> NDArray[np.float32]:
+    return ball_views(ANGLES, SHAPE, 0.0, (np.where(LATER, x, 0), 0.0, np.where(LATER, z, 0)))
+
+
+def test_views_after_a_jump_are_corrected_by_shifts(tmp_path: Path) -> None:
+    selection = Selection(views="first:55", axis_col=23.5, steps=(Air("none"),))
+    found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), selection)
+    assert found.geometry.n_views == 55 and found.left_out == 0 and found.held_out is not None
+    later, shifts, unseen = LATER[:55], found.geometry.shifts, found.held_out[1]
+    assert (shifts[~later] == 0).all()
+    np.testing.assert_allclose(shifts[later, 0], 1.5 * np.cos(ANGLES[:55][later]), atol=0.2)
+    np.testing.assert_allclose(shifts[later, 1], 1.0, atol=0.2)
+    np.testing.assert_allclose(unseen.shifts[:, 1], shifts[-1, 1])
+    assert told.startswith("The sample jumped at frame 45. 19 views are corrected by shifts: the sample lies +1.")
+    assert told == found.done["jumps"].sentence and found.view_weights is None  # what `opposite` saw is corrected
+    rays = found.ray_weights(3)
+    assert rays is not None and len(rays) == 55 + 3
+    assert (rays[:JUMP] == 1).all() and (rays[JUMP:-3, 0] == 0).all() and (rays[JUMP:-3, 2:] == 1).all()
+
+
+def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
+    views = moved(0.0, 0.0)
+    views[LATER] = ball_views(ANGLES[LATER], SHAPE, seed=1)
+    found, told = prepared(scan(tmp_path, views, JUMP))
+    assert found.geometry.n_views == JUMP and found.left_out == 19 and not found.geometry.shifts.any()
+    assert "19 views are left out: no shift and turn of the sample makes them fit" in told
+
+
+def test_spoilt_views_between_two_false_alarms_hide_no_jump(tmp_path: Path) -> None:
+    views = moved(2.0, 2.0)
+    views[15:20] += np.random.default_rng(1).normal(0, 0.5, (5, *SHAPE)).astype(np.float32)
+    found, told = prepared(scan(tmp_path, views, 15, 20, JUMP), replace(SELECTION, binning=2))
+    assert told.startswith("The sample jumped at frame 45. 19 views are corrected by shifts")
+    assert "After the alarm of motion at frames 19, 24 the other views show nothing" in told
+    assert found.geometry.n_views == ANGLES.size and (found.geometry.shifts[~LATER] == 0).all()
+
+
+def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
+    found, told = prepared(scan(tmp_path, moved(0.0, 0.0), 20, 22))
+    assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
+    assert told.startswith("After the alarm of motion at frames 24, 26 the other views show nothing (less than 0.5 px)")
+
+
+@pytest.mark.parametrize(
+    ("selection", "said"),
+    [
+        (Selection(axis_col=23.5, steps=(Flags("ignore"),)), "--flags ignore: 1 view with an alarm"),
+        (
+            Selection(axis_col=23.5, steps=(Jumps("ignore"),)),
+            "The monitor saw the sample jump at frame 45; --jumps ignore",
+        ),
+        (Selection(axis_col=23.5, cone=(100.0, 200.0)), "Views of a cone beam are not corrected"),
+    ],
+)
+def test_who_wants_them_as_they_are_and_cones_get_them_so(tmp_path: Path, selection: Selection, said: str) -> None:
+    found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), selection)
+    assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
+    assert said in told

@@ -1,0 +1,78 @@
+"""Phase of a scan: the same views in batches, bands of rows and slabs; what it must know is the file's or asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.phase.phase import Phase
+from beamline.projections.selection import Selection
+from recon.prep.correct import merge_and_empty
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import BEAM, DARK
+
+PHASE = Phase("20", distance_mm=50.0, energy_kev=20.0)
+SELECTION = Selection(pixel_size_mm=1e-3, steps=(Air("none"), PHASE))
+
+
+def _source() -> ArraySource:
+    rng = np.random.default_rng(3)
+    views = DARK + BEAM * np.exp(-rng.uniform(0, 1, (8, 48, 40)))
+    data = np.concatenate([np.full((1, 48, 40), DARK), np.full((1, 48, 40), DARK + BEAM), views]).astype(np.uint16)
+    return ArraySource(data, [2, 1] + [0] * 8, np.concatenate([[np.nan] * 2, np.radians(np.arange(0, 180, 22.5))]))
+
+
+def _correction(selection: Selection) -> ScanCorrection:
+    return ScanCorrection(_source(), selection, pytest.fail)  # type: ignore[arg-type]
+
+
+def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
+    correction, frames = _correction(SELECTION), np.arange(2, 10)
+    whole = correction.at_once(frames)
+    fed = [correction.feed(frames[:3], last=False), correction.feed(frames[3:], last=True)]
+    parts = merge_and_empty([part for part in fed if part is not None])
+    np.testing.assert_array_equal(parts.data, whole.data)
+    out = np.empty(whole.data.shape, np.float32)
+    np.testing.assert_array_equal(correction.in_batches(frames, out, 3, lambda *_: None).data, whole.data)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
+    """Rows around those chosen are read as far as the filter reaches, so that a band has no mirrors of its own."""
+    frames, selection = np.arange(2, 10), replace(SELECTION, binning=binning)
+    whole = _correction(selection).at_once(frames).data
+    band = _correction(replace(selection, rows=(20, 28))).at_once(frames).data
+    assert band.shape[1] == 8 // binning
+    np.testing.assert_allclose(band, whole[:, 20 // binning : 28 // binning], atol=0.01)
+    narrow = _correction(selection).at_once(frames, slice(4, 6)).data
+    np.testing.assert_allclose(narrow, whole[:, 4:6], atol=0.01)
+    assert whole.std() < 0.5 * _correction(selection.with_steps(Phase())).at_once(frames).data.std()
+
+
+def test_what_the_file_does_not_say_is_asked_for() -> None:
+    source = _source()
+    with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev"):
+        Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
+    source.attributes, source.energy_kev = {"distance_mm": 50.0}, 20.0
+    found, said = Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
+    assert found == PHASE.filter_of(source, SELECTION)[0]  # type: ignore[arg-type]
+    assert "delta/beta 20 at 20 keV, 50 mm behind" in said
+    with pytest.raises(ConfigError, match=r"has 48 x 40"):
+        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
+        _correction(SELECTION.with_steps(CountModel("counts")))
+
+
+def test_a_cone_is_scaled_to_the_sample() -> None:
+    source = _source()
+    source.cone = (10.0, 40.0)
+    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION)  # type: ignore[arg-type]
+    near = replace(SELECTION, pixel_size_mm=0.25e-3)
+    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near)  # type: ignore[arg-type]
+    assert "30 mm behind" in said and found.length == pytest.approx(plane.length)

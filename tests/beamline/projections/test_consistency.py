@@ -1,0 +1,87 @@
+"""A scan whose angles, heights or axis are wrong is told of, with what its views show; a right one is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from beamline.projections.consistency import warn_of_inconsistency
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from recon.base.geometry import Geometry
+from tests.beamline.array_source import ArraySource
+from tests.recon.prep.balls import Balls
+
+ANGLES, AXIS = np.linspace(0, np.pi, 45, endpoint=False), 36.8
+VIEWS = Balls(ANGLES, (24, 72), AXIS).views() + np.random.default_rng(3).normal(0, 0.01, (45, 24, 72))
+
+
+@cache
+def stretched() -> tuple[PreparedProjections, list[str]]:
+    """The scan, stated at angles 1.06 times as large, as it is prepared, and what was told of it."""
+    source = ArraySource(VIEWS.astype(np.float32), [0] * len(VIEWS), ANGLES * 1.06)
+    source.quantity, sentences = "line_integrals", list[str]()
+    return prepare_projections(source, Selection(axis_col=AXIS), sentences.append), sentences  # type: ignore[arg-type]
+
+
+def told(views: np.ndarray, axis_col: float = AXIS, angles: np.ndarray = ANGLES) -> list[str]:
+    scan, sentences = stretched()[0], list[str]()
+    projections = replace(scan.projections, data=views.astype(np.float32))
+    geometry = Geometry.parallel(angles, VIEWS.shape[1:], axis_col=axis_col)
+    scan = replace(scan, projections=projections, geometry=geometry)
+    warn_of_inconsistency(scan, Selection(axis_col=axis_col), sentences.append)
+    return sentences
+
+
+def test_a_right_scan_is_not_told_of() -> None:
+    assert told(VIEWS) == []
+
+
+def test_every_scan_is_looked_at() -> None:
+    assert any("stated to turn by 186.6" in sentence for sentence in stretched()[1])
+
+
+def test_air_that_is_not_at_zero_has_moments_of_its_own() -> None:
+    assert told(VIEWS - 0.5, angles=ANGLES * 1.06) == []
+
+
+@pytest.mark.parametrize("scale", [0.95, 1.06])
+def test_angles_of_another_scale(scale: float) -> None:
+    (sentence,) = told(VIEWS, angles=ANGLES * scale)
+    assert f"are stated to turn by {176 * scale:.4g}" in sentence
+    assert "--angles" in sentence
+
+
+def test_frames_that_were_turned_upside_down() -> None:
+    views = VIEWS.copy()
+    views[1::2] = views[1::2, ::-1]
+    (sentence,) = told(views)
+    assert sentence.startswith("22 views of 45 looked at (frames 1, 3, 5, 7")
+
+
+def test_a_sample_that_sinks() -> None:
+    views = VIEWS.copy()
+    views[22:, 2:], views[22:, :2] = VIEWS[22:, :-2], VIEWS[22:, :1]
+    assert any("up to 2." in sentence and "--calibrate shifts" in sentence for sentence in told(views))
+
+
+def test_a_sample_that_shakes() -> None:
+    away = np.random.default_rng(5).integers(-1, 2, len(VIEWS))
+    views = np.stack([np.roll(view, by, axis=1) for view, by in zip(VIEWS, away, strict=True)])
+    (sentence,) = told(views)
+    assert "leaves its way about the axis by 2." in sentence or "by 1.9" in sentence
+
+
+def test_a_rod_in_the_beam_of_a_few_views() -> None:
+    views = VIEWS.copy()
+    views[20:24, :, 30:34] += 2
+    assert any(sentence.startswith("4 views of 45 looked at (frames 20-23) hold +") for sentence in told(views))
+
+
+def test_another_axis_than_the_one_given() -> None:
+    sentences = told(VIEWS, AXIS + 1)
+    assert any("go round column 36.8" in sentence and "column 37.8" in sentence for sentence in sentences)

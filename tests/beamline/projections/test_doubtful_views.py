@@ -1,0 +1,43 @@
+"""What a scan reads well and yet is doubtful: an axis that its views contradict, and views that are copies."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from tests.beamline.array_source import ArraySource
+
+ROWS, COLS, VIEWS, AXIS = 8, 64, 60, 33.0
+
+
+def told(selection: Selection, copies: tuple[int, ...] = ()) -> list[str]:
+    """What is told of a scan of two balls, by the formula of a sphere's chord.
+
+    Args:
+        copies: views that are those before them.
+    """
+    rng = np.random.default_rng(3)
+    angles = np.radians(np.linspace(0, 180, VIEWS, endpoint=False))
+    row, col = np.arange(ROWS) - (ROWS - 1) / 2, np.arange(COLS) - AXIS
+    depth = np.zeros((VIEWS, ROWS, COLS))
+    for x, y, radius, mu in ((0, 0, 22, 0.01), (9, 5, 6, 0.04)):
+        at = (x * np.cos(angles) + y * np.sin(angles))[:, None, None]
+        depth += 2 * mu * np.sqrt((radius**2 - (col - at) ** 2 - row[:, None] ** 2).clip(0))
+    light = np.concatenate([np.zeros((3, ROWS, COLS)), np.ones((3, ROWS, COLS)), np.exp(-depth)])
+    frames = rng.poisson(3e4 * light + 100).astype(np.uint16)
+    for view in copies:
+        frames[6 + view] = frames[5 + view]
+    source, sentences = ArraySource(frames, [2] * 3 + [1] * 3 + [0] * VIEWS, np.r_[np.full(6, np.nan), angles]), []
+    prepare_projections(source, selection, sentences.append)  # type: ignore[arg-type]
+    return [sentence for sentence in sentences if "mirror images" in sentence or "view before" in sentence]
+
+
+def test_a_scan_that_is_as_stated_is_not_doubted() -> None:
+    assert told(Selection(axis_col=AXIS + 0.4)) == []
+
+
+def test_copies_and_an_axis_that_opposite_views_contradict_are_named() -> None:
+    axis, copied = told(Selection(axis_col=COLS - 1 - AXIS + 5), copies=(30, 31, 40))
+    assert "mirror images about column 33." in axis and "the rotation axis given is column 35." in axis
+    assert copied.startswith("3 views of 60 (frames 36-37, 46) hold the pixels of the view before")

@@ -1,0 +1,51 @@
+"""The tables of docs/file_layout.md, and what files hold, for tests that compare them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import h5py
+
+PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encoding="utf-8")
+
+
+def rows(title: str) -> list[list[str]]:
+    """Cells of the tables in a section of the page, without the heads."""
+    section = re.split(r"^#+ ", PAGE, flags=re.M)
+    (text,) = [part for part in section if part.startswith(f"{title}\n")]
+    lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+
+
+def names(title: str) -> list[str]:
+    return [row[0].strip("` ") for row in rows(title)]
+
+
+def unmatched(found: Iterable[str], named: Iterable[str]) -> tuple[set[str], set[str]]:
+    """What was found and is not on the page, and what the page names and was not found."""
+    found, pattern = set(found), {}
+    for name in named:
+        pattern[name] = re.compile(re.sub(r"<[^>]*>", "[^/]+", re.escape(name).replace(r"\ ", " ")) + r"\Z")
+    return (
+        {path for path in found if not any(p.match(path) for p in pattern.values())},
+        {name for name, p in pattern.items() if not any(p.match(path) for path in found)},
+    )
+
+
+def paths(*files: Path) -> set[str]:
+    """Every dataset in HDF5 files, by every name that leads to it."""
+    found: set[str] = set()
+
+    def walk(group: h5py.Group) -> None:
+        for name, item in group.items():
+            if isinstance(item, h5py.Group):
+                walk(item)
+            else:
+                found.add(f"{group.name.rstrip('/')}/{name}")
+
+    for path in files:
+        with h5py.File(path) as file:
+            walk(file)
+    return found

@@ -1,0 +1,115 @@
+"""What a sample is called does not make it a dark or a flat; angles in names are read; hidden files are no images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.images.image_names import angles_of, kinds_of
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.reference_files import load_images
+from drivers.base.frame import FrameKind
+
+SHAPE, VIEWS = (4, 6), 12
+DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
+SAMPLES = (
+    "white_flower", "dark_chocolate", "flatworm", "flat_screen", "white", "dark", "flat", "whiteboard", "ob",
+    "open_beam", "df_01_b", "sample",
+)  # fmt: skip
+REFERENCES = ({"dark_{}": DARK, "flat_{}": FLAT}, {"df/{}": DARK, "ob/{}": FLAT}, {"DF_{}": DARK, "OB_{}": FLAT})
+
+
+@given(
+    sample=st.sampled_from(SAMPLES), references=st.sampled_from(REFERENCES), folder=st.sampled_from(["", "run_white/"]),
+    apart=st.booleans(), n=st.integers(1, 5),
+)  # fmt: skip
+def test_any_sample_is_told_from_its_references(
+    sample: str, references: dict[str, FrameKind], folder: str, apart: bool, n: int
+) -> None:
+    views = f"{sample}/{sample}_{{}}" if apart else f"{sample}_{{}}"
+    if views.lower() in {name.lower() for name in references}:
+        return  # the same names: one series
+    expected = {f"{folder}{views.format(f'{i:04d}')}.tif": VIEW for i in range(VIEWS)}
+    for name, kind in references.items():
+        expected |= {f"{folder}{name.format(f'{i:03d}')}.tif": kind for i in range(n)}
+    assert kinds_of("scan", sorted(expected)) == dict(sorted(expected.items()))
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_a_series_alone_is_the_scan_that_was_given(sample: str) -> None:
+    names = [f"{sample}_{i:03d}.tif" for i in range(VIEWS)]
+    assert set(kinds_of("scan", names).values()) == {VIEW}
+
+
+def test_references_alone_are_no_scan() -> None:
+    names = [f"{name}_{i}.tif" for name in ("flat_before", "flat_after", "dark") for i in range(3)]
+    with pytest.raises(DataError, match=r"\(3 of 'flat_before_.tif'.* --darks and --flats"):
+        kinds_of("scan", names)
+
+
+def _written(folder: Path, names: list[str]) -> None:
+    for i, name in enumerate(names):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(folder / name, np.full(SHAPE, i, np.uint16))
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "20191030_sample_{whole:03d}_{thousandths:03d}_{i:04d}.tiff",  # ORNL
+        "sample_{i:04d}_angle_{degrees:.3f}.tif",
+        "sample_{i:04d}_{degrees:.3f}deg.tif",
+        "theta={degrees:.3f}_{i}.tif",
+    ],
+)
+def test_angles_in_names_go_with_their_frames_in_the_order_of_numbers(tmp_path: Path, pattern: str) -> None:
+    degrees = np.round((np.arange(VIEWS) * 111.246) % 180, 3)  # golden: the order of angles is another
+    facts = [{"whole": int(a), "thousandths": round(a % 1 * 1000), "degrees": a, "i": i} for i, a in enumerate(degrees)]
+    _written(tmp_path, [pattern.format(**fact) for fact in facts])
+    with open_scan(tmp_path) as source:
+        np.testing.assert_allclose(np.degrees(source.angles), degrees, atol=1e-9)
+        assert source.read(range(VIEWS))[:, 0, 0].tolist() == list(range(VIEWS))
+        assert source.attributes["angles_from"] == "the names of the files"
+    with open_scan(SourceOptions(tmp_path, angles=np.radians(degrees[::-1]))) as source:  # those given go first
+        np.testing.assert_allclose(np.degrees(source.angles), degrees[::-1])
+
+
+def test_other_numbers_in_names_are_no_angles() -> None:
+    tiles = [f"sample_{i // 4:03d}_{i % 4:03d}_{i:04d}.tif" for i in range(VIEWS)]
+    assert angles_of(tiles) is None
+    assert angles_of([f"sample_{i:04d}.tif" for i in range(VIEWS)]) is None
+    assert angles_of([f"angle_5_{i:04d}.tif" for i in range(VIEWS)]) is None
+    assert angles_of([]) is None
+
+
+def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
+    names = [f"a_{i}.tif" for i in range(3)] + [f"dark_{i}.tif" for i in range(2)]
+    _written(tmp_path, names)
+    for name in names:
+        (tmp_path / f"._{name}").write_bytes(b"\0\5\26\7" + bytes(100))
+    (tmp_path / "._angles.txt").write_bytes(b"\0\5\26\7")
+    (tmp_path / "angles.txt").write_text("0\n1\n2\n")
+    with open_scan(tmp_path) as source:
+        assert source.image_key.tolist() == [2, 2, 0, 0, 0]
+        np.testing.assert_allclose(np.degrees(source.angles[2:]), [0, 1, 2])
+    assert len(load_images(tmp_path, DARK)) == 5
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le-bom"])
+def test_a_byte_order_mark_is_no_part_of_angles(tmp_path: Path, encoding: str) -> None:
+    _written(tmp_path / "s", [f"a_{i}.tif" for i in range(3)])
+    text = "# view\r\n0.5\r\n1,\r\n".replace("1,", "1.5") + "2.5"
+    content = b"\xff\xfe" + text.encode("utf-16-le") if encoding.endswith("bom") else text.encode(encoding)
+    for place, options in (
+        (tmp_path / "angles.txt", SourceOptions(tmp_path / "s", angles=tmp_path / "angles.txt")),
+        (tmp_path / "s/angles.txt", SourceOptions(tmp_path / "s")),
+    ):
+        place.write_bytes(content)
+        with open_scan(options) as source:
+            np.testing.assert_allclose(np.degrees(source.angles), [0.5, 1.5, 2.5])

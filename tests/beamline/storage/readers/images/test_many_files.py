@@ -1,0 +1,61 @@
+"""TIFFs of many pages and archives of many files open at once, or are refused."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.images import tiff_series, tiff_stack
+from beamline.storage.readers.open import open_scan
+
+
+def _pages(path: Path, n: int, last: tuple[int, int] = (4, 6)) -> Path:
+    with tifffile.TiffWriter(path) as file:
+        for i in range(n):
+            file.write(np.full((4, 6) if i < n - 1 else last, i, np.uint16), contiguous=False)
+    return path
+
+
+def test_appended_pages_are_read_as_they_were_written_and_the_time_grows_with_their_number(tmp_path: Path) -> None:
+    path = _pages(tmp_path / "a.tif", 2000)
+    began = time.process_time()
+    with open_scan(path) as source:
+        spent = time.process_time() - began
+        np.testing.assert_array_equal(source.read([0, 1999, 7])[:, 0, 0], [0, 1999, 7])
+    began = time.process_time()
+    with tifffile.TiffFile(path) as file:
+        assert len(file.series) == 2000  # what it takes the square of the number for
+    assert spent < 0.5 * (time.process_time() - began)
+
+
+def test_a_page_of_another_shape_among_many_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiff_stack, "MANY_PAGES", 5)
+    with open_scan(_pages(tmp_path / "a.tif", 9, last=(5, 6))) as source:
+        assert source.image_key.size == 9
+        with pytest.raises(DataError, match=r"Page 8 of .*uint16 \(5, 6\)"):
+            source.read([8])
+
+
+@pytest.mark.parametrize("n", [6, 70_000])  # the latter are counted in another place
+def test_an_archive_of_more_files_than_any_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n: int) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for i in range(n):
+            archive.writestr(f"{i}.tif", b"")
+    assert tiff_series._entries(tmp_path / "a.zip") == n
+    monkeypatch.setattr(tiff_series, "MOST_FILES", 5)
+    with pytest.raises(DataError, match="holds more than 5 files"):
+        open_scan(tmp_path / "a.zip")
+
+
+def test_a_folder_of_more_files_than_any_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiff_series, "MOST_FILES", 5)
+    for i in range(8):
+        (tmp_path / f"{i}.tif").touch()
+    with pytest.raises(DataError, match="holds more than 5 files"):
+        open_scan(tmp_path)

@@ -1,0 +1,51 @@
+"""The features of `[tool.splatline.features]`: their folders, and how many statements the core and each feature have.
+
+python -m tests.features [ROOT]
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import tomllib
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("beamline", "recon", "drivers", "simulators")
+
+
+@cache
+def table(root: Path = ROOT) -> dict[str, list[str]]:
+    """Folders of each feature, and its tests' folders, which mirror them."""
+    features: dict[str, list[str]] = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "splatline"
+    ]["features"]
+    return features
+
+
+def folders(feature: str, root: Path = ROOT) -> list[Path]:
+    """Of a feature, with those of its tests, as far as they exist."""
+    own = [root / folder for folder in table(root)[feature]]
+    return [path for each in own for path in (each, root / "tests" / each.relative_to(root)) if path.is_dir()]
+
+
+def statements(path: Path) -> int:
+    return sum(isinstance(node, ast.stmt) for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+def counted(root: Path = ROOT) -> dict[str, int]:
+    """Statements of the four packages by feature; "core": of what belongs to none."""
+    owners = {root / folder: feature for feature, own in table(root).items() for folder in own}
+    counts = {"core": 0, **dict.fromkeys(table(root), 0)}
+    for package in PACKAGES:
+        for path in (root / package).rglob("*.py"):
+            counts[next((owners[p] for p in path.parents if p in owners), "core")] += statements(path)
+    return counts
+
+
+if __name__ == "__main__":
+    counts = counted(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT)
+    for feature, count in sorted(counts.items(), key=lambda item: -item[1]):
+        print(f"{feature:<12}{count:>7}")
+    print(f"{'all':<12}{sum(counts.values()):>7}")

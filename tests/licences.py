@@ -1,0 +1,180 @@
+"""Licences of all that an installation brings, from the metadata of what is installed here; writes docs/licences.md.
+
+python -m tests.licences        # in an environment with all extras
+
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+import tomllib
+from collections.abc import Iterable, Iterator
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "licences.md"
+
+FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "surface", "txrm", "cluster", "tango")
+FOR_DEVELOPERS = ("dev", "docs", "oracle", "browser")
+
+# Where the metadata name no licence, or only a family: read in the licence file of the package.
+READ = {
+    "algotom": "Apache-2.0",
+    "bluesky": "BSD-3-Clause",
+    "dask-jobqueue": "BSD-3-Clause",
+    "dicttoxml": "GPL-2.0",
+    "hdf5plugin": "MIT",  # its plug-ins: BSD, MIT, Apache-2.0, Zlib and that of bzip2
+    "historydict": "BSD-3-Clause",
+    "mongoquery": "Unlicense",
+    "pytest-timeout": "MIT",
+    "pyusb": "BSD-3-Clause",
+}
+
+# Brought on other systems, or by other builds, than the one where the page is written.
+ELSEWHERE = {
+    "colorama": ("BSD-3-Clause", "Windows: click, pytest"),
+    "pywin32": ("PSF-2.0", "Windows: packages of the tests"),
+    "nvidia-*": ("NVIDIA's own", "CUDA builds of torch; never needed"),
+    "cuda-*": ("NVIDIA's own", "CUDA builds of torch; never needed"),
+}
+
+_CLASSES = {
+    "BSD License": "BSD",
+    "MIT License": "MIT",
+    "MIT No Attribution License (MIT-0)": "MIT-0",
+    "Apache Software License": "Apache-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+    "ISC License (ISCL)": "ISC",
+    "The Unlicense (Unlicense)": "Unlicense",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+}
+
+
+def key(name: str) -> str:
+    """A name of a distribution as the index compares it."""
+    return str(canonicalize_name(name))
+
+
+def licence(package: Distribution) -> str:
+    """As SPDX expression where the metadata give one; "" where they give nothing that is short enough to be a name."""
+    said = package.metadata
+    if key(said["Name"]) in READ:
+        return READ[key(said["Name"])]
+    if said.get("License-Expression"):
+        return str(said["License-Expression"])
+    classes = [line.split(" :: ")[-1] for line in said.get_all("Classifier") or () if line.startswith("License :: ")]
+    if named := [_CLASSES.get(name, name) for name in classes if name != "OSI Approved"]:
+        return " AND ".join(named)
+    text = str(said.get("License") or "").strip()
+    return text if len(text) < 60 and "\n" not in text else ""
+
+
+def wanted(extra: str | None) -> list[Requirement]:
+    """What pyproject.toml names for an extra; None: for every installation."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = project["dependencies"] if extra is None else project["optional-dependencies"][extra]
+    return [Requirement(line) for line in lines]
+
+
+def brought(requirements: Iterable[Requirement]) -> dict[str, Distribution]:
+    """The distributions that requirements bring in this environment, by name: with all that these require in turn.
+
+    What is not installed here is left out.
+    """
+    got: dict[str, Distribution] = {}
+    to_do, done = list(requirements), set[tuple[str, frozenset[str]]]()
+    while to_do:
+        requirement = to_do.pop()
+        name = key(requirement.name)
+        if (name, frozenset(requirement.extras)) in done:
+            continue
+        done.add((name, frozenset(requirement.extras)))
+        try:
+            package = distribution(name)
+        except PackageNotFoundError:
+            continue
+        got[name] = package
+        to_do += _required(package, requirement.extras)
+    return got
+
+
+def _required(package: Distribution, extras: set[str]) -> Iterator[Requirement]:
+    for line in package.requires or ():
+        requirement = Requirement(line)
+        if requirement.marker is None or any(requirement.marker.evaluate({"extra": e}) for e in ("", *extras)):
+            yield requirement
+
+
+def gpl(words: str) -> bool:
+    """Whether a licence is the GPL or the AGPL (not the LGPL), without an exception and without another to choose."""
+    return (
+        re.search(r"(?<!L)GPL|(?<!Lesser )General Public", words) is not None
+        and " WITH " not in words
+        and " OR " not in words
+    )
+
+
+def rows() -> dict[str, str]:
+    """The licence of each package that the page names, by name."""
+    lines = re.findall(r"(?m)^\| ([^|]+?) \| ([^|]+?) \|", PAGE.read_text(encoding="utf-8"))
+    return {name: words for name, words in lines if name not in ("package", "---")}
+
+
+def row_of(name: str, named: Iterable[str]) -> str | None:
+    """The name of the row that is of a package, which may end in a star; None: there is none."""
+    return next((row for row in named if fnmatch.fnmatch(name, row)), None)
+
+
+def page() -> str:
+    """The page as Markdown."""
+    users = {extra: brought(wanted(extra)) for extra in FOR_USERS}
+    base = brought(wanted(None))
+    developers = {extra: brought(wanted(extra)) for extra in FOR_DEVELOPERS}
+    parts = [
+        "# Licences",
+        "splatline is BSD-3-Clause. Its wheel holds one file of another project: uPlot 1.6.32, MIT, with its licence\n"
+        "beside it. `python -m tests.licences` writes this page from the metadata of what is installed, with what\n"
+        "packages bring in turn. A test fails where an installed package has no row, and where one that users install\n"
+        "is under the GPL. What each direct dependency is for: [dependencies](decisions/dependencies.md).",
+        "Wheels of numpy and scipy hold libgfortran, and those of torch libgomp: GPL with the exception that lets any\n"
+        "program use them. pyusb loads the system's libusb (LGPL), a driver for DCAM cameras the vendor's library;\n"
+        "neither is shipped.",
+        "## Every installation",
+        _table(dict.fromkeys(base, ""), base),
+        "## Extras for users",
+        _section(users, set(base)),
+        "## Tests and docs",
+        "No user needs these. The one under the GPL, dicttoxml, is brought by nabu (tomoscan), which reads our scans\n"
+        "in the tests.",
+        _section(developers, set(base).union(*users.values())),
+        "## On other systems, and with other builds of torch",
+        _lines((name, words, why) for name, (words, why) in ELSEWHERE.items()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(extras: dict[str, dict[str, Distribution]], before: set[str]) -> str:
+    """What extras bring beside what there was before, and which of them."""
+    packages = {name: package for each in extras.values() for name, package in each.items() if name not in before}
+    by = {name: ", ".join(f"`{extra}`" for extra, each in extras.items() if name in each) for name in packages}
+    return _table(by, packages)
+
+
+def _table(why: dict[str, str], packages: dict[str, Distribution]) -> str:
+    return _lines((name, licence(packages[name]), why[name]) for name in sorted(packages))
+
+
+def _lines(cells: Iterable[tuple[str, str, str]]) -> str:
+    lines = list(cells)
+    last = any(why for *_, why in lines)
+    head = "| package | licence | brought by |\n|---|---|---|" if last else "| package | licence |\n|---|---|"
+    return "\n".join([head, *("| " + " | ".join(line if last else line[:2]) + " |" for line in lines)])
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8", newline="\n")

@@ -1,0 +1,161 @@
+"""The public names and what each must be given, from the modules themselves; writes docs/public_names.md.
+
+python -m tests.public_names        # in an environment with all extras
+
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+import textwrap
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from recon.methods import REGISTRY
+
+PAGE = Path(__file__).parents[1] / "docs" / "public_names.md"
+
+# What scripts use: all of `__all__`.
+FOR_SCRIPTS = ("recon", "beamline.api")
+
+# With the extra `bluesky`; of their classes ophyd-async says what can be called.
+FOR_BLUESKY = {
+    "beamline.bluesky.devices": ("Rotation", "TomoScan", "fly", "tomography"),
+    "beamline.bluesky.camera": ("CameraDetector",),
+}
+
+# What other packages add and prove devices, formats and methods with.
+FOR_PACKAGES = {
+    "recon.base.method": ("Method", "ReconProblem", "Traits"),
+    "recon.testing": ("MethodConformance",),
+    "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
+    "beamline.projections.step": ("StepDone", "StepMemory", "option"),
+    "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
+    "beamline.storage.volumes.base": ("Slices", "VolumeFormat", "bare_record"),
+    "beamline.monitor.check": ("Check", "Flag", "Level", "Look", "Policy", "ScanContext"),
+    "beamline.testing": ("ReaderConformance",),
+    "drivers.base.clock": ("Clock",),
+    "drivers.base.errors": ("DeviceError", "DeviceRefused", "DeviceTimeout"),
+    "drivers.base.frame": ("Frame", "FrameKind"),
+    "drivers.base.protocols": (
+        "Camera", "CameraFrame", "CameraSettings", "CameraTiming", "RotationStage", "StageLimits", "TriggerSource",
+        "TriggerTrain",
+    ),
+    "drivers.cameras": ("CameraDriver",),
+    "drivers.stages.settings": ("StageDriver", "StageSettings", "key"),
+    "drivers.testing.camera": ("CameraConformance",),
+    "drivers.testing.stages": ("StageConformance", "StepStageConformance"),
+    "simulators.effects.catalogue": ("Domain",),
+}  # fmt: skip
+
+_OURS = ("beamline", "recon", "drivers", "simulators")
+
+
+def lines(module: str) -> list[str]:
+    """A line for each public name of a module, and one for each public member of its classes.
+
+    Behind a name stand the parameters that have no default, in their order; those behind a star by name.
+    """
+    loaded = import_module(module)
+    named = {**FOR_BLUESKY, **FOR_PACKAGES}.get(module) or {*loaded.__all__}
+    if module == "recon":  # also the methods that it finds in the folders of its features
+        named = {*named, *(entry.cls for entry in REGISTRY.values())}
+    told: list[str] = []
+    for name in sorted(named):
+        value = getattr(loaded, name)
+        told.append(name + required(value))
+        if inspect.isclass(value) and not name.endswith("Conformance") and module not in FOR_BLUESKY:
+            told += [f"{name}.{member}" for member in members(value)]
+    return told
+
+
+def members(cls: type) -> Iterator[str]:
+    """Fields and methods that a class has of us, not of Python or of a library; of a method its settings alone."""
+    fields = {each.name for each in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else set[str]()
+    own = {name for base in cls.__mro__ if base.__module__.split(".")[0] in _OURS for name in vars(base)}
+    for name in sorted(fields if fields and "traits" in own else fields | own):
+        if not name.startswith("_"):
+            member = inspect.getattr_static(cls, name, None)
+            is_called = isinstance(member, staticmethod | classmethod) or inspect.isfunction(member)
+            yield name + (required(getattr(cls, name), method=inspect.isfunction(member)) if is_called else "")
+
+
+def required(value: Any, *, method: bool = False) -> str:
+    """The parameters without a default, in brackets; "" of what is not called, or is called as a library says.
+
+    Args:
+        method: leave the first one out.
+    """
+    if not callable(value) or (inspect.isclass(value) and not _has_parameters(value)):
+        return ""
+    parameters = list(inspect.signature(value).parameters.values())[1 if method else 0 :]
+    needed = [each for each in parameters if each.default is each.empty and each.kind not in _SEVERAL]
+    words = [each.name for each in needed if each.kind is not inspect.Parameter.KEYWORD_ONLY]
+    by_name = [each.name for each in needed if each.kind is inspect.Parameter.KEYWORD_ONLY]
+    return f"({', '.join([*words, *(['*', *by_name] if by_name else [])])})"
+
+
+_SEVERAL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def _has_parameters(cls: type) -> bool:
+    """Whether scripts make values of the class, with parameters that we define."""
+    abstract = getattr(cls, "_is_protocol", False) or inspect.isabstract(cls)
+    made_by = next(base for base in cls.__mro__ if "__init__" in vars(base) or "__new__" in vars(base))
+    return not abstract and made_by.__module__.split(".")[0] in _OURS
+
+
+def recorded(module: str) -> set[str]:
+    """The lines of a module that the page holds."""
+    match = re.search(rf"(?s)### {re.escape(module)}\n\n```text\n(.*?)\n```", PAGE.read_text(encoding="utf-8"))
+    told: set[str] = set()
+    for block in re.split(r"\n(?! )", match[1]) if match else ():
+        head, *rest = re.sub(r"\n +", " ", block).split(": ", 1)
+        told |= {head, *(f"{head.partition('(')[0]}.{member}" for each in rest for member in each.split("; "))}
+    return told
+
+
+def page() -> str:
+    """The page as Markdown."""
+    parts = [
+        "# Public names",
+        "What stands here stays within a major version ([releases](releases.md#what-a-version-promises)), with the\n"
+        "parameters that must be given: they stand in brackets, those behind a star are given by name. Parameters\n"
+        "with a default may be added. What does not stand here may change with any version.\n"
+        "`python -m tests.public_names` writes this page; a test compares it with the modules.",
+        "## For scripts and notebooks",
+        *map(_section, FOR_SCRIPTS),
+        "## For plans of bluesky",
+        *map(_section, FOR_BLUESKY),
+        "## For packages that add devices, formats and methods",
+        "With the entry points `splatline.method`, `correction`, `reader`, `volume_format`, `stage`, `wire`,\n"
+        "`camera`, `check` and `effect` ([contributing](contributing.md)).",
+        *map(_section, FOR_PACKAGES),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(module: str) -> str:
+    blocks: dict[str, list[str]] = {}
+    for line in lines(module):
+        name, is_member, _ = line.partition("(")[0].partition(".")
+        if is_member:
+            head = next(each for each in blocks if each.partition("(")[0] == name)
+            blocks[head].append(line.removeprefix(f"{name}."))
+        else:
+            blocks[line] = []
+    told = [f"{head}: {'; '.join(each)}" if each else head for head, each in blocks.items()]
+    wrapped = [
+        line
+        for each in told
+        for line in textwrap.wrap(each, 110, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    ]
+    return f"### {module}\n\n```text\n" + "\n".join(wrapped) + "\n```"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8", newline="\n")

@@ -1,0 +1,127 @@
+"""Features are folders that can be removed: the core runs without each of them, and without all."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from beamline.cli.commands import CORE
+from tests.features import PACKAGES, ROOT, folders, table
+
+_LOADS = """
+import sys
+
+import click
+
+from beamline.cli.main import main
+from beamline.instrument.connect import connect
+from simulators.wires.registry import WIRES
+
+context = click.Context(main)
+commands = {name: main.get_command(context, name) for name in main.list_commands(context)}
+assert set(sys.argv[1:]) <= set(commands)
+main(["--help"])
+"""
+_METHODS = "import recon\nfor entry in recon.methods.REGISTRY.values(): getattr(recon, entry.cls)()"
+_QUICK = ("tests/recon/base/test_geometry.py", "tests/recon/base/test_registry.py", "tests/simulators/frame")
+_SCAN = (
+    "monitor={}",
+    "scan.angles.views=9",
+    "scan.mode=step",
+    "simulation.scene=scenes/ideal.yaml",
+    "simulation.clock=virtual",
+)
+"""Of the simulated configuration, with the checks of the core."""
+
+
+PARENTS = (
+    "beamline/config/families", "beamline/features", "beamline/monitor", "beamline/projections/corrections",
+    "beamline/storage/readers", "beamline/storage/volumes", "drivers/stages", "recon/features", "simulators/effects",
+    "simulators/samples/builders", "simulators/wires",
+)  # fmt: skip
+"""Registries look for features in the folders of these."""
+
+
+def test_each_folder_of_features_is_in_the_table() -> None:
+    within = [
+        path.parent.relative_to(ROOT).as_posix() for parent in PARENTS for path in (ROOT / parent).glob("*/__init__.py")
+    ]
+    named = [folder for own in table().values() for folder in own]
+    assert len(named) == len(set(named))
+    assert not [folder for folder in named if not (ROOT / folder).is_dir()]
+    assert set(within) <= set(named)
+
+
+def test_a_newcomer_sees_the_commands_of_the_core_first_and_no_more_than_22() -> None:
+    assert len(CORE) <= 22
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of what the features live in."""
+    root = tmp_path_factory.mktemp("copy")
+    ignored = shutil.ignore_patterns("__pycache__", "*.npz", ".*cache")
+    for folder in (*PACKAGES, "configs", "tests"):
+        shutil.copytree(ROOT / folder, root / folder, ignore=ignored)
+    shutil.copy(ROOT / "pyproject.toml", root)
+    return root
+
+
+@contextmanager
+def _without(features: list[str], root: Path) -> Iterator[None]:
+    """The copy without these features' folders, which come back afterwards."""
+    moved = [(path, root / "aside" / str(n)) for n, path in enumerate(p for f in features for p in folders(f, root))]
+    (root / "aside").mkdir(exist_ok=True)
+    for path, aside in moved:
+        path.rename(aside)
+    try:
+        yield
+    finally:
+        for path, aside in moved:
+            aside.rename(path)
+
+
+def _run(root: Path, *words: str) -> str:
+    ended = subprocess.run(
+        [sys.executable, *words], cwd=root, env=_environment(root), capture_output=True, text=True, timeout=200,
+        check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
+    return ended.stdout
+
+
+def _environment(root: Path) -> dict[str, str]:
+    import os
+
+    return os.environ | {"PYTHONPATH": str(root)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("feature", [name for name in table() if name != "shared"])
+def test_the_core_loads_without_a_feature(feature: str, copied: Path) -> None:
+    with _without([feature], copied):
+        help_page = _run(copied, "-c", _LOADS, *CORE)
+    for name in CORE:
+        assert f"\n  {name} " in help_page
+
+
+@pytest.mark.slow
+def test_the_core_keeps_its_contracts_and_passes_its_quick_tests_without_any(copied: Path) -> None:
+    with _without(list(table()), copied):
+        assert "More commands" not in _run(copied, "-c", _LOADS, *CORE)
+        _run(copied, "-c", "from importlinter.cli import lint_imports_command; lint_imports_command()", "--no-cache")
+        _run(copied, "-c", _METHODS)
+        _run(copied, "-m", "pytest", "-q", "-p", "no:cacheprovider", *_QUICK)
+
+
+@pytest.mark.slow
+def test_the_core_scans_with_one_family_of_stages(copied: Path) -> None:
+    settings = (word for setting in _SCAN for word in ("--set", setting))
+    with _without([name for name in table() if name not in ("pm16c", "shared")], copied):
+        _run(copied, "-m", "beamline.cli.main", "scan", "configs/simulated.yaml", "--no-live", *settings)
