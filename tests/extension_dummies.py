@@ -375,7 +375,7 @@ class Lift:
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
-    (("beamline/projections/registry.py", '    "Rings": "rings",', '    "Lift": "lift",'),),
+    (("beamline/projections/registry.py", '    "Width": "width",', '    "Lift": "lift",'),),
     """
 from pathlib import Path
 
