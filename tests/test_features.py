@@ -26,10 +26,17 @@ from simulators.wires.registry import WIRES
 context = click.Context(main)
 commands = {name: main.get_command(context, name) for name in main.list_commands(context)}
 assert set(sys.argv[1:]) <= set(commands)
+for name in commands:
+    main([name, "--help"], standalone_mode=False)
 main(["--help"])
 """
 _METHODS = "import recon\nfor entry in recon.methods.REGISTRY.values(): getattr(recon, entry.cls)()"
-_QUICK = ("tests/recon/base/test_geometry.py", "tests/recon/base/test_registry.py", "tests/simulators/frame")
+_QUICK = (
+    "tests/beamline/plan", "tests/beamline/report", "tests/beamline/simulate", "tests/recon/assess",
+    "tests/recon/base/test_geometry.py", "tests/recon/base/test_registry.py", "tests/recon/kernels",
+    "tests/simulators/frame", "tests/simulators/light", "tests/simulators/pixels", "tests/simulators/samples",
+)  # fmt: skip
+"""Tests of the core that use no feature."""
 _SCAN = (
     "monitor={}",
     "scan.angles.views=9",

@@ -64,7 +64,8 @@ class Grouped(Repeatable):
         helps = [option for option in (self._help_all, self.get_help_option(ctx)) if option is not None]
         if not ctx.meta.get(_ALL):
             by_name = {option.name: option for option in self.grouped()}
-            _section("Options", [by_name[name] for name in self.first] + helps, ctx, formatter)
+            first = [by_name[name] for name in self.first if name in by_name]  # a feature's option goes with it
+            _section("Options", first + helps, ctx, formatter)
             return
         for group in (*GROUPS, None):
             options = [option for option in self.grouped() if getattr(option, _GROUP, None) == group]
