@@ -32,7 +32,7 @@ BIN = "Scripts" if os.name == "nt" else "bin"
 FIVE = {
     "diamond": ("diamond_24737_parallel_91x135x160.h5",),
     "tooth": ("aps2bm_tooth_181x2x640.h5",),
-    "walnut": ("walnut_parallel_rebinned_240x96x256.h5", "--views", "every:4"),
+    "walnut": ("walnut_parallel_rebinned_240x96x256.h5", "--views", "every:4", "--quantity", "line-integrals"),
     "grains": ("grains_128x16x50.tif", "--quantity", "line-integrals", "--angles", "grains_128x16x50.txt"),
     "grains, 256 columns": ("grains_256x16x90.tif", "--quantity", "line-integrals", "--angles", "grains_256x16x90.txt"),
 }
