@@ -44,7 +44,9 @@ def test_the_rates_of_a_line_are_found_again(first: float, second: float, thread
 @pytest.mark.parametrize("seconds", [(9.0, 3.0), (1.0, 900.0)])
 def test_no_rate_is_below_zero_on_a_busy_machine(seconds: tuple[float, float]) -> None:
     clock = Counting()
-    timed = tuple(module.SizedRun(a, b, clock.taking(s)) for (a, b), s in zip([(10, 20), (30, 600)], seconds, strict=True))
+    timed = tuple(
+        module.SizedRun(a, b, clock.taking(s)) for (a, b), s in zip([(10, 20), (30, 600)], seconds, strict=True)
+    )
     found = module.rate_of(timed, clock)
     assert min(found) >= 0 and 30 * found.first + 600 * found.second == pytest.approx(seconds[1])
 

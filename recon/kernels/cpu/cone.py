@@ -5,8 +5,8 @@ y. In every plane of voxels that they cross, the detector's rows meet a line of 
 once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row].
 
 Sixteen rows meet at most 32 neighbouring slices, and sixteen slices as many rows, so their numbers are picked from two
-vectors. With longer steps fewer rows or slices are taken at once. Tiles of the volume stay in the cache, as those of
-`cpu.joseph`. The transpose has the same weights and runs tile by tile: no two threads write to one voxel.
+vectors (`picks`). With longer steps fewer rows or slices are taken at once. Tiles of the volume stay in the cache, as
+those of `cpu.joseph`. The transpose has the same weights and runs tile by tile: no two threads write to one voxel.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu import joseph, lanes
 from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.kernels.cpu.joseph import CALL, EDGE, F64, TILE, Flags, calls, samples, shares, tile_of
-from recon.kernels.cpu.picks import least, pick, whole
+from recon.kernels.cpu.picks import NEAR, bilinear, bilinear_near, lanes_a_window, least, pick, pick_near, whole
 
 _f = np.float32
 _WIDTH = lanes.WIDTH
@@ -114,7 +114,7 @@ def _forward(
         tile = np.zeros((EDGE * EDGE, _room(views[v0:v1], row0, row1, volume.shape)), np.float32)
         at, share = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
         climbs, steps = np.empty(TILE), np.empty(TILE, np.float32)
-        slices, far = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
+        slices, far = np.empty(TILE, np.int32), np.empty(TILE, np.float32)
         for y0 in range(0, ny, TILE):
             for x0 in range(0, nx, TILE):
                 y1, x1 = min(y0 + TILE, ny), min(x0 + TILE, nx)
@@ -140,29 +140,35 @@ def _forward(
                         if n == 0:
                             continue
                         line, highest = v * cols + col, _climbs(rays, v, col, j, n, climbs, steps)[1]
-                        wide = math.floor(min((2 * _WIDTH - 3) / highest + 1.0, _WIDTH))
+                        wide = _together(1.0 / highest)
                         for row in range(row0, row1, wide):
                             count = min(row1 - row, wide)
                             for k in range(n):
                                 level = views[v, 8] + climbs[k] * (row - views[v, 7])
-                                whole_level = min(max(math.floor(level), z0 * 1.0), z1 * 1.0)
-                                slices[k], far[k] = int(whole_level) - z0, level - whole_level
+                                whole_level = min(max(np.floor(level), z0 * 1.0), z1 * 1.0)
+                                slices[k], far[k] = np.int32(whole_level - z0), level - whole_level
                             total = lanes.load_first(lines, line, row, count)
                             for k in range(n):
                                 i, z, high = base + at[k], slices[k], share[k]
-                                h = i + along
-                                a, b = lanes.load(tile, i, z), lanes.load(tile, i, z + _WIDTH)
-                                a = a + (lanes.load(tile, h, z) - a) * high
-                                b = b + (lanes.load(tile, h, z + _WIDTH) - b) * high
                                 level = lanes.iota() * steps[k] + far[k]
-                                lower = pick(a, b, level, 0)
-                                total = total + lower + (pick(a, b, level, 1) - lower) * (level - whole(level))
+                                if steps[k] <= NEAR:
+                                    total = total + bilinear_near(tile, i, i + along, high, z, level)
+                                else:
+                                    total = total + bilinear(tile, i, i + along, high, z, level)
                             lanes.store_first(lines, line, row, total, count)
         for v in range(v0, v1):
             for col in range(cols):
                 for row in range(row0, row1):
                     slope = (row - views[v, 7]) * rays[v, col, 5]
                     out[v, col, row] *= _f(rays[v, col, 4] * math.sqrt(1.0 + slope * slope))
+
+
+@njit(inline="always")
+def _together(apart):
+    """Rows or slices that are taken at once, where from one to the next it is 1 / apart numbers of a window."""
+    sharing = lanes_a_window()
+    span = (2 * sharing - 3) * apart
+    return _WIDTH if span >= sharing - 1 else math.floor(span + 1.0)
 
 
 @njit(inline="always")
@@ -208,7 +214,7 @@ def _adjoint(
         tile = np.zeros((EDGE * EDGE, block + _WIDTH), np.float32)
         at, share = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
         climbs, steps, back = np.empty(TILE), np.empty(TILE, np.float32), np.empty(TILE, np.float32)
-        first, far = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
+        first, far = np.empty(TILE, np.int32), np.empty(TILE, np.float32)
         lowest = math.inf
         for v in range(len(views)):
             lowest = min(lowest, _box(views[v], y0, y1, x0, x1)[0])
@@ -233,34 +239,34 @@ def _adjoint(
                 _ray(lines, v * cols + col, path, lean, _f(middle), low_row, high_row, margin, ray)
                 for k in range(n):
                     back[k] = 1.0 / climbs[k]
-                wide = math.floor(min((2 * _WIDTH - 4) * low + 1.0, _WIDTH))
+                wide = _together(low)
                 most = math.floor(2.0 / low) + 1  # rows within a slice of any slice
                 for z in range(z0, z1, wide):
                     for k in range(n):
                         edge = middle + (z - 1 - views[v, 8]) / climbs[k]
-                        row = min(max(math.ceil(edge), low_row - margin * 1.0), high_row * 1.0)
-                        first[k], far[k] = int(row) - low_row + margin, edge - row + 1.0
+                        row = min(max(np.ceil(edge), low_row - margin * 1.0), high_row * 1.0)
+                        first[k], far[k] = np.int32(row - (low_row - margin)), edge - row + 1.0
                     for k in range(n):
                         c, step, height = first[k], z - z0, steps[k]
                         places = lanes.iota() * back[k] + far[k]
                         weight = (whole(places) - places) * height + height  # slices from the lower end to that row
-                        a, b = lanes.load(ray, 0, c), lanes.load(ray, 0, c + _WIDTH)
-                        if low >= 1.0 and high <= 2.0:
+                        if low >= 1.0 / NEAR and high <= 2.0:
                             beyond = _f(2) - weight
-                            found = pick(a, b, places, 0) * least(weight, beyond)
-                            found = found + pick(a, b, places, 1) * lanes.positive(beyond - height)
+                            found = pick_near(ray, 0, c, places, 0) * least(weight, beyond)
+                            found = found + pick_near(ray, 0, c, places, 1) * lanes.positive(beyond - height)
                         elif most == 3 and high <= 1.0:
                             further = weight + height
                             beyond = _f(2) - further
-                            found = pick(a, b, places, 0) * weight
-                            found = found + pick(a, b, places, 1) * least(further, beyond)
-                            found = found + pick(a, b, places, 2) * lanes.positive(beyond - height)
+                            found = pick(ray, 0, c, places, 0) * weight
+                            found = found + pick(ray, 0, c, places, 1) * least(further, beyond)
+                            found = found + pick(ray, 0, c, places, 2) * lanes.positive(beyond - height)
                         else:
-                            found = pick(a, b, places, 0) * lanes.positive(least(weight, _f(2) - weight))
+                            found = pick(ray, 0, c, places, 0) * lanes.positive(least(weight, _f(2) - weight))
                             for m in range(1, most):
                                 weight = weight + height
-                                a, b = lanes.load(ray, 0, c + m), lanes.load(ray, 0, c + m + _WIDTH)
-                                found = found + pick(a, b, places, 0) * lanes.positive(least(weight, _f(2) - weight))
+                                found = found + pick(ray, 0, c + m, places, 0) * lanes.positive(
+                                    least(weight, _f(2) - weight)
+                                )
                         if wide < _WIDTH:
                             found = lanes.between(found, 0, wide)
                         i = base + at[k]
