@@ -9,8 +9,6 @@ plane, and no two threads write to one voxel.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
@@ -103,8 +101,8 @@ def samples(first, step, low0, low1, j0, j1, across, along, at, share):
         b += 1
     for k in range(b - a):
         exact = first + step * (a + k)
-        low = min(max(math.floor(exact), low0), low1 - 1)
-        at[k] = (a + k - j0) * across + (low - low0) * along
+        low = min(max(np.floor(exact), np.float64(low0)), np.float64(low1 - 1))
+        at[k] = np.int32(a + k - j0) * np.int32(across) + np.int32(low - low0) * np.int32(along)  # AVX2 has these
         share[k] = exact - low
     return a, b - a
 

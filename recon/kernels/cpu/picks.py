@@ -170,8 +170,8 @@ def _bilinear(near: bool) -> Any:
 pick, pick_near = _pick(False), _pick(True)
 """pick(array, row, col, at, further): array[row, col + whole(at) + further], within a window.
 
-`array` is float32, contiguous in the last axis, and reaches to col + 32 + further. A lane that would pick elsewhere, as one
-that nobody wants, has any number of there.
+`array` is float32, contiguous in the last axis, and reaches to col + 32 + further. A lane that would pick elsewhere, as
+one that nobody wants, has any number of there.
 """
 bilinear, bilinear_near = _bilinear(False), _bilinear(True)
 """bilinear(array, row, other, share, col, at): the array at col + at, between two rows by the other one's share."""
