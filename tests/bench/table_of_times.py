@@ -1,6 +1,6 @@
 """The first minute and the first second: a table of whole commands, several runs of each checkout in turn.
 
-    python tests/bench/table_of_times.py FOLDER [--runs 5] [--only WORD] [--only WORD] [CHECKOUT ...]
+    python tests/bench/table_of_times.py FOLDER [CHECKOUT ...] [--runs 5] [--only WORD] [--only WORD]
 
 FOLDER takes scans, environments and results; measured scans come from ../shared/data beside this checkout. Each row is
 run once of every checkout (this one where none is named), then again, so that a busy minute falls on all of them. Times
@@ -45,6 +45,7 @@ class Row:
     Attributes:
         words: after `beamline`, or of pip where `install` is set.
         moments: names of events whose first time is wanted; "word" is the first output of any kind.
+        new: the packages as they were installed a moment ago: nothing compiled but what they carry.
         first_run: with no kernel compiled, and none carried.
         by_level: once for each level of x86-64.
         refused: the command ends with an error.
@@ -53,6 +54,7 @@ class Row:
     name: str
     words: tuple[str, ...]
     moments: tuple[str, ...] = ()
+    new: bool = False
     first_run: bool = False
     by_level: bool = False
     refused: bool = False
@@ -63,7 +65,8 @@ def rows() -> Iterator[Row]:
     demo, large = ("demo", "--json", "-o"), ("grains_512x128x180.tif", "--quantity", "line-integrals")
     large += ("--angles", "grains_512x128x180.txt", "--pixel-size-um", "10")
     yield Row("pip install", (), install=True)
-    yield Row("demo, nothing compiled", (*demo, "demo"), ("word", "frame", "slices"), first_run=True)
+    yield Row("demo, the first command", (*demo, "demo"), ("word", "frame", "slices"), new=True)
+    yield Row("demo, no kernel compiled or carried", (*demo, "demo"), ("word", "frame", "slices"), first_run=True)
     yield Row("demo", (*demo, "demo"), ("word", "frame", "slices"))
     yield Row("recon of a missing scan", ("recon", "missing.h5"), ("word",), refused=True)
     yield Row("scan of a missing configuration", ("scan", "missing.yaml"), ("word",), refused=True)
@@ -99,6 +102,13 @@ def measured(row: Row, checkout: Path, folder: Path, level: Mapping[str, str]) -
     if row.first_run:
         shutil.rmtree(folder / "kernels", ignore_errors=True)
         environment["NUMBA_CACHE_DIR"] = str(folder / "kernels")
+    if row.new:
+        shutil.rmtree(folder / "packages", ignore_errors=True)
+        for package in ("beamline", "configs", "drivers", "recon", "simulators"):
+            ignored = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(checkout / package, folder / "packages" / package, ignore=ignored)
+        shutil.copy(checkout / "pyproject.toml", folder / "packages")
+        environment["PYTHONPATH"] = str(folder / "packages")
     if row.install:
         shutil.rmtree(folder / "environment", ignore_errors=True)
         venv.create(folder / "environment", with_pip=True)
@@ -146,11 +156,12 @@ def table(wanted: Callable[[Row], bool], checkouts: list[Path], folder: Path, ru
     for row in filter(wanted, rows()):
         kinds = [(level.name, level.environment) for level in levels] if row.by_level else [("", {})]
         times = {(checkout, name): Times() for checkout in checkouts for name, _ in kinds}
-        for run in range(runs + (not row.first_run and not row.install)):
+        first_counts = row.new or row.first_run or row.install
+        for run in range(runs + (not first_counts)):
             for name, environment in kinds:
                 for checkout in checkouts:
                     seconds = measured(row, checkout, folder, environment)
-                    if run or row.first_run or row.install:
+                    if run or first_counts:
                         times[checkout, name].add(seconds)
         for (checkout, name), of in times.items():
             cells = [of.text(column) for column in ("whole", "processor", "word", "frame", "slices")]
