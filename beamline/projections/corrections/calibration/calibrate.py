@@ -81,6 +81,8 @@ class Calibrate:
         return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
 
     def memory(self, part: ScanPart) -> StepMemory:
+        if not self.terms:  # nothing of it is loaded
+            return StepMemory()
         from recon.features.calibration.background import background_memory
         from recon.features.calibration.gains import gains_memory
 
@@ -90,6 +92,8 @@ class Calibrate:
 
     def refuse_few(self, used: int, usable: int, cols: int) -> None:
         """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+        if not self.terms:
+            return
         from recon.features.calibration import background, gains
         from recon.features.calibration.learn import LEAST_VIEWS
 
