@@ -66,10 +66,11 @@ class Projector:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        reach = float(np.hypot(*np.abs(self.grid.edges[:, :2]).max(0)))
+        beyond = self.grid.voxel_size / 2  # the outermost voxels are interpolated to zero
+        reach = float(np.hypot(*(np.abs(self.grid.edges[:, :2]).max(0) + beyond)))
         if self.geometry.is_cone and reach >= self.geometry.source_distance:
             raise ValueError(
-                f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
+                f"the box and half a voxel beyond reach {reach:.4g} mm from the rotation axis, but the source is at "
                 f"{self.geometry.source_distance:.4g} mm: give a smaller grid"
             )
         found = [

@@ -4,8 +4,8 @@ All rays to one column of the detector lie in one plane parallel to the rotation
 y. In every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is sampled
 once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row].
 
-Sixteen rows meet at most 32 neighbouring slices, and sixteen slices as many rows, so their numbers are picked from two
-vectors (`picks`). With longer steps fewer rows or slices are taken at once. Tiles of the volume stay in the cache, as
+Sixteen rows meet at most 32 neighbouring slices, and sixteen slices as many rows, from which their numbers are picked
+(`picks` says how). With longer steps fewer rows or slices are taken at once. Tiles of the volume stay in the cache, as
 those of `cpu.joseph`. The transpose has the same weights and runs tile by tile: no two threads write to one voxel.
 """
 
@@ -21,7 +21,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu import joseph, lanes
 from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.kernels.cpu.joseph import CALL, EDGE, F64, TILE, Flags, calls, samples, shares, tile_of
-from recon.kernels.cpu.picks import NEAR, bilinear, bilinear_near, lanes_a_window, least, pick, pick_near, whole
+from recon.kernels.cpu.picks import NEAR_STEP, bilinear, bilinear_near, lanes_per_window, least, pick, pick_near, whole
 
 _f = np.float32
 _WIDTH = lanes.WIDTH
@@ -140,7 +140,7 @@ def _forward(
                         if n == 0:
                             continue
                         line, highest = v * cols + col, _climbs(rays, v, col, j, n, climbs, steps)[1]
-                        wide = _together(1.0 / highest)
+                        wide = _count_at_once(1.0 / highest)
                         for row in range(row0, row1, wide):
                             count = min(row1 - row, wide)
                             for k in range(n):
@@ -151,7 +151,7 @@ def _forward(
                             for k in range(n):
                                 i, z, high = base + at[k], slices[k], share[k]
                                 level = lanes.iota() * steps[k] + far[k]
-                                if steps[k] <= NEAR:
+                                if steps[k] <= NEAR_STEP:
                                     total = total + bilinear_near(tile, i, i + along, high, z, level)
                                 else:
                                     total = total + bilinear(tile, i, i + along, high, z, level)
@@ -164,11 +164,11 @@ def _forward(
 
 
 @njit(inline="always")
-def _together(apart):
-    """Rows or slices that are taken at once, where from one to the next it is 1 / apart numbers of a window."""
-    sharing = lanes_a_window()
-    span = (2 * sharing - 3) * apart
-    return _WIDTH if span >= sharing - 1 else math.floor(span + 1.0)
+def _count_at_once(apart):
+    """How many rows or slices are taken at once, where from one to the next a place moves by 1 / apart."""
+    lanes_sharing = lanes_per_window()
+    steps = (2 * lanes_sharing - 3) * apart  # that fit into a window, rounding and the number beyond included
+    return _WIDTH if steps >= lanes_sharing - 1 else math.floor(steps + 1.0)
 
 
 @njit(inline="always")
@@ -239,7 +239,7 @@ def _adjoint(
                 _ray(lines, v * cols + col, path, lean, _f(middle), low_row, high_row, margin, ray)
                 for k in range(n):
                     back[k] = 1.0 / climbs[k]
-                wide = _together(low)
+                wide = _count_at_once(low)
                 most = math.floor(2.0 / low) + 1  # rows within a slice of any slice
                 for z in range(z0, z1, wide):
                     for k in range(n):
@@ -250,7 +250,7 @@ def _adjoint(
                         c, step, height = first[k], z - z0, steps[k]
                         places = lanes.iota() * back[k] + far[k]
                         weight = (whole(places) - places) * height + height  # slices from the lower end to that row
-                        if low >= 1.0 / NEAR and high <= 2.0:
+                        if low >= 1.0 / NEAR_STEP and high <= 2.0:
                             beyond = _f(2) - weight
                             found = pick_near(ray, 0, c, places, 0) * least(weight, beyond)
                             found = found + pick_near(ray, 0, c, places, 1) * lanes.positive(beyond - height)

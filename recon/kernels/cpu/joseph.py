@@ -102,7 +102,9 @@ def samples(first, step, low0, low1, j0, j1, across, along, at, share):
     for k in range(b - a):
         exact = first + step * (a + k)
         low = min(max(np.floor(exact), np.float64(low0)), np.float64(low1 - 1))
-        at[k] = np.int32(a + k - j0) * np.int32(across) + np.int32(low - low0) * np.int32(along)  # AVX2 has these
+        at[k] = np.int32(a + k - j0) * np.int32(across) + np.int32(low - low0) * np.int32(
+            along
+        )  # AVX2 has no int64 of a float64
         share[k] = exact - low
     return a, b - a
 

@@ -16,8 +16,8 @@ from numba.extending import intrinsic
 
 from recon.kernels.cpu.lanes import LANES, WIDTH
 
-NEAR = 1 - 1e-5
-"""From lane to lane, at most, of those that are near one another: eight lie among eight neighbours, rounded or not."""
+NEAR_STEP = 1 - 1e-5
+"""The longest step from lane to lane at which eight lanes, rounding included, pick from eight neighbours."""
 
 _F32, _I32 = ir.FloatType(), ir.IntType(32)
 _VF, _VI = ir.VectorType(_F32, WIDTH), ir.VectorType(_I32, WIDTH)
@@ -26,8 +26,8 @@ _HF, _HI = ir.VectorType(_F32, _HALF), ir.VectorType(_I32, _HALF)
 _LAST = 2 * WIDTH - 1  # as a mask of bits
 _FAST = ("fast",)
 
-Numbers = Callable[[Any, Any], Any]
-"""Code for the neighbours from an offset (LLVM's i64) on, as a vector of a given type."""
+Loader = Callable[[Any, Any], Any]
+"""Emits a load of the neighbours from an offset (LLVM's i64) on, as a vector of a given type."""
 
 
 def _integers(value: int, kind: Any = _VI) -> Any:
@@ -47,15 +47,15 @@ def _features(context: Any) -> str:
     return str(context.codegen().magic_tuple()[2])
 
 
-def _lanes_a_window(context: Any) -> int:
+def _lanes_per_window(context: Any) -> int:
     return _HALF if "+avx2" in _features(context) and "+avx512f" not in _features(context) else WIDTH
 
 
-def _picked(context: Any, builder: Any, numbers: Numbers, at: Any, further: Any, near: bool) -> Any:
-    """The numbers at + further, from their window. Lanes that are `near` step by at most NEAR."""
+def _pick_sixteen(context: Any, builder: Any, numbers: Loader, at: Any, further: Any, near: bool) -> Any:
+    """The numbers at + further, from their window. Lanes that are `near` step by at most NEAR_STEP."""
     offset = ir.IntType(64)
-    if _lanes_a_window(context) == _HALF:
-        halves = [_half(builder, numbers, at, further, first, near) for first in (0, _HALF)]
+    if _lanes_per_window(context) == _HALF:
+        halves = [_pick_eight(builder, numbers, at, further, first, near) for first in (0, _HALF)]
         return builder.shuffle_vector(*halves, ir.Constant(_VI, list(range(WIDTH))))
     places = builder.add(at, _broadcast(builder, builder.trunc(further, _I32), _VI))
     if "+avx512f" in _features(context):
@@ -69,11 +69,11 @@ def _picked(context: Any, builder: Any, numbers: Numbers, at: Any, further: Any,
     return picked
 
 
-def _half(builder: Any, numbers: Numbers, at: Any, further: Any, first: int, near: bool) -> Any:
+def _pick_eight(builder: Any, numbers: Loader, at: Any, further: Any, first: int, near: bool) -> Any:
     """Eight lanes from `first` on by AVX2: from eight neighbours, or from one of two eights."""
     places, start = builder.shuffle_vector(at, at, ir.Constant(_HI, list(range(first, first + _HALF)))), further
     if first:
-        # A window lies within the 32 neighbours, also where lanes that nobody wants would begin elsewhere.
+        # The window lies within 32 neighbours from `further` on, also where lanes that nobody wants begin elsewhere.
         begin = builder.extract_element(places, ir.Constant(_I32, 0))
         for symbol, bound in (("<", 0), (">", WIDTH)):
             begin = builder.select(builder.icmp_signed(symbol, begin, _I32(bound)), _I32(bound), begin)
@@ -90,7 +90,7 @@ def _half(builder: Any, numbers: Numbers, at: Any, further: Any, first: int, nea
     return builder.select(above, permuted(_HALF), permuted(0))
 
 
-def _line(context: Any, builder: Any, kind: Any, array: Any, row: Any, col: Any) -> Numbers:
+def _line(context: Any, builder: Any, kind: Any, array: Any, row: Any, col: Any) -> Loader:
     """The numbers of a row from a column on."""
     struct = context.make_array(kind)(context, builder, array)
     strides = cgutils.unpack_tuple(builder, struct.strides, 2)
@@ -105,11 +105,11 @@ def _line(context: Any, builder: Any, kind: Any, array: Any, row: Any, col: Any)
 
 
 @intrinsic
-def lanes_a_window(typing_context):
+def lanes_per_window(typing_context):
     """Lanes that pick from one window: eight by AVX2, sixteen elsewhere."""
 
     def code(context, builder, signature, args):
-        return ir.IntType(64)(_lanes_a_window(context))
+        return ir.IntType(64)(_lanes_per_window(context))
 
     return types.intp(), code
 
@@ -138,7 +138,7 @@ def _pick(near: bool) -> Any:
     def pick(typing_context, array, row, col, at, further):
         def code(context, builder, signature, args):
             numbers = _line(context, builder, signature.args[0], *args[:3])
-            return _picked(context, builder, numbers, builder.fptosi(args[3], _VI), args[4], near)
+            return _pick_sixteen(context, builder, numbers, builder.fptosi(args[3], _VI), args[4], near)
 
         return LANES(array, types.intp, types.intp, LANES, types.intp), code
 
@@ -156,11 +156,14 @@ def _bilinear(near: bool) -> Any:
                 return builder.fadd(lower, step, flags=_FAST)
 
             def numbers(offset: Any, vector: Any) -> Any:
-                return between(*(line(offset, vector) for line in lines), _broadcast(builder, share, vector))
+                lower, upper = (line(offset, vector) for line in lines)
+                return between(lower, upper, _broadcast(builder, share, vector))
 
             places = builder.fptosi(at, _VI)
-            columns = [_picked(context, builder, numbers, places, col.type(further), near) for further in (0, 1)]
-            return between(*columns, builder.fsub(at, builder.sitofp(places, _VF), flags=_FAST))
+            lower, upper = (
+                _pick_sixteen(context, builder, numbers, places, col.type(further), near) for further in (0, 1)
+            )
+            return between(lower, upper, builder.fsub(at, builder.sitofp(places, _VF), flags=_FAST))
 
         return LANES(array, types.intp, types.intp, types.float32, types.intp, LANES), code
 
@@ -168,10 +171,14 @@ def _bilinear(near: bool) -> Any:
 
 
 pick, pick_near = _pick(False), _pick(True)
-"""pick(array, row, col, at, further): array[row, col + whole(at) + further], within a window.
+"""pick(array, row, col, at, further): array[row, col + whole(at) + further], lane by lane.
 
-`array` is float32, contiguous in the last axis, and reaches to col + 32 + further. A lane that would pick elsewhere, as
-one that nobody wants, has any number of there.
+Of lanes that are wanted, whole(at) is 0 or more, and with `further` less than 32; by AVX2 less than 16 from the first
+lane of each eight. Others get some number of the window. `array` is float32, contiguous in the last axis, and is read
+up to col + 32 + further. `pick_near` is for lanes that step by at most NEAR_STEP.
 """
 bilinear, bilinear_near = _bilinear(False), _bilinear(True)
-"""bilinear(array, row, other, share, col, at): the array at col + at, between two rows by the other one's share."""
+"""bilinear(array, row, other, share, col, at): the array at col + at, between two rows by the other one's share.
+
+It picks at `at` and at one column further, as `pick` does. `bilinear_near` is for lanes that step by at most NEAR_STEP.
+"""

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from recon.compiled.level import V3
 from recon.kernels.cpu import lanes
-from recon.kernels.cpu.picks import NEAR, bilinear, bilinear_near, lanes_a_window, least, pick, pick_near, whole
+from recon.kernels.cpu.picks import NEAR_STEP, bilinear, bilinear_near, lanes_per_window, least, pick, pick_near, whole
 
 F32 = NDArray[np.float32]
 
 
 @njit
 def _sharing() -> int:
-    return lanes_a_window()
+    return lanes_per_window()
 
 
 @njit
@@ -52,12 +52,12 @@ def test_picks_are_those_of_an_array() -> None:
     rng = np.random.default_rng(0)
     numbers, out = rng.normal(size=(2, 80)).astype(np.float32), np.empty((4, 16), np.float32)
     most = (2 * _sharing() - 3) / (_sharing() - 1)
-    for step in (0.01, 0.5, 0.999, NEAR, 1.0, 1.3, most):
+    for step in (0.01, 0.5, 0.999, NEAR_STEP, 1.0, 1.3, most):
         for start in (0.0, 0.37, 1 - 1e-7):
             at = (start + step * np.arange(16)).astype(np.float32)[None]
             for further in (0, 1):
                 want = _expected(numbers, at[0], 7, further, 0.3)
-                for kernel in (_kernel, _near) if step <= NEAR else (_kernel,):
+                for kernel in (_kernel, _near) if step <= NEAR_STEP else (_kernel,):
                     kernel(numbers, at, 7, further, 0.3, out)
                     np.testing.assert_array_equal(out[0], want[0])
                     np.testing.assert_allclose(out[1], want[1], atol=2e-6)
@@ -67,11 +67,13 @@ def test_picks_are_those_of_an_array() -> None:
 
 def test_lanes_that_nobody_wants_read_within_32_neighbours() -> None:
     numbers = np.full((2, 80), np.inf, np.float32)
-    numbers[:, 20:53] = 1
+    numbers[:, 20:54] = 1
     out = np.empty((4, 16), np.float32)
     for at in (np.linspace(-90, 90, 16), np.full(16, -70.0), np.full(16, 1000.0), np.arange(16) * 4.0):
-        _kernel(numbers, at.astype(np.float32)[None], 20, 1, 0.5, out)
-        assert (out[0] == 1).all()
+        for kernel in (_kernel, _near):
+            kernel(numbers, at.astype(np.float32)[None], 20, 1, 0.5, out)
+            assert (out[0] == 1).all()
+            assert np.isfinite(out[1]).all()
 
 
 @pytest.mark.slow
@@ -84,7 +86,7 @@ def test_picks_need_no_avx512(level: Mapping[str, str]) -> None:
         __file__,
         str(root / "tests/recon/voxels/test_projector.py"),
         "-k",
-        "picks or sixteen or transpose or chords",
+        "pick or lanes or transpose or chords or matrix",
     ]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", *tests],
