@@ -77,7 +77,7 @@ class Grid:
         across, along = 2 * geometry.reach / voxel_size, (high - low) / voxel_size
         nx, nz = (max(1, math.ceil(n - 1e-6)) for n in (across, along))  # a rounding error adds no voxel
         if geometry.is_cone:  # the corners, and half a voxel beyond, do not reach the source
-            nx = max(1, min(nx, math.ceil(math.sqrt(2) * geometry.source_distance / voxel_size - 1 - 1e-6) - 1))
+            nx = max(1, min(nx, math.floor(math.sqrt(2) * geometry.source_distance / voxel_size - 1 - 1e-6)))
         return cls((nz, nx, nx), voxel_size, ((low + high) / 2, 0.0, 0.0))
 
     @classmethod
@@ -98,7 +98,7 @@ class Grid:
     def widened(self, by: float, geometry: Geometry) -> Grid:
         """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
         nz, nx, _ = self.shape
-        most = math.ceil(math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6) - 1
+        most = math.sqrt(2) * geometry.source_distance / self.voxel_size - 1 - 1e-6
         across = max(nx, math.floor(min(by * nx, most)))
         return replace(self, shape=(nz, across, across))
 

@@ -70,8 +70,8 @@ class Projector:
         reach = float(np.hypot(*(np.abs(self.grid.edges[:, :2]).max(0) + beyond)))
         if self.geometry.is_cone and reach >= self.geometry.source_distance:
             raise ValueError(
-                f"the box and half a voxel beyond reach {reach:.4g} mm from the rotation axis, but the source is at "
-                f"{self.geometry.source_distance:.4g} mm: give a smaller grid"
+                f"the box reaches {reach:.4g} mm from the rotation axis, with half a voxel beyond it, but the source "
+                f"stands at {self.geometry.source_distance:.4g} mm: give a smaller grid"
             )
         found = [
             (band, [self._rays(at) for at in views_of_exposure(views)])
