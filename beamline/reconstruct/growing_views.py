@@ -39,7 +39,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     timing, sink, clock = options.follow, channels.sink, channels.clock
     assert timing is not None
     with suppress(NotReadyError):
-        options.source.open(follow=True).close()  # a file that is none is refused before anything is compiled
+        options.source.open(follow=True).close()  # what is no scan is refused before anything is compiled
     _compile(options, channels, timing)
     with channels.stop_scope() as should_stop:
         with _open(options, channels, timing) as source:

@@ -15,7 +15,7 @@ from typing import Any
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.core.events import event_in
 from beamline.core.text import one_line
-from beamline.page.event_values import event_values
+from beamline.page.event_values import RunValues, event_values, published
 from beamline.page.run_files import Reader, watched
 from beamline.scan.control import Asked, Verb, ask
 from beamline.scan.runs import DIED, newest
@@ -23,39 +23,13 @@ from beamline.scan.states import State
 from beamline.storage.hdf5 import NotReadyError
 
 
-def _pv(name: str, about: str, default: Any, unit: str = "") -> Any:
-    return field(default=default, metadata={"pv": name, "about": about, "unit": unit})
-
-
 @dataclass(frozen=True)
-class RunValues:
-    """The present values of a run; each field is a process variable, with its name, meaning and unit as metadata.
+class ProcessVariables(RunValues):
+    """The values of a run that are process variables."""
 
-    Names that tomoscan (APS) has are as there. Numbers are NaN or -1 where they are not known.
-    """
-
-    run: str = _pv("Run", "folder of the run", "")
-    sample: str = _pv("SampleName", "name of the sample", "")
-    file: str = _pv("FileName", "scan file", "")
-    state: str = _pv("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done, died ...", "idle")
-    message: str = _pv("Message", "what the scan said last", "")
-    planned: int = _pv("ImagesPlanned", "frames that the scan takes in all", -1)
-    exposed: int = _pv("ImagesCollected", "frames exposed", 0)
-    stored: int = _pv("ImagesSaved", "frames in the file", 0)
-    percent: float = _pv("PercentComplete", "of the frames planned", 0.0, "%")
-    rate: float = _pv("FrameRate", "frames a second", math.nan, "Hz")
-    data_rate: float = _pv("DataRate", "data a second", math.nan, "MB/s")
-    time_left: float = _pv("RemainingTime", "until the last frame", math.nan, "s")
-    mean: float = _pv("MeanCounts", "of the newest frame", math.nan, "counts")
-    beam: float = _pv("Beam", "last reading of the beam monitor", math.nan)
-    warnings: int = _pv("Warnings", "flags of the monitor that warn", 0)
-    alarms: int = _pv("Alarms", "flags of the monitor that are alarms", 0)
-    last_flag: str = _pv("LastFlag", "check, frame and advice of the last flag", "")
-    views: int = _pv("ReconViews", "views in the live volume", 0)
-    residual: float = _pv("ReconResidual", "of the views that the live volume has not learnt", math.nan)
-    free: float = _pv("DiskFree", "of the disk with the scan file", math.nan, "GB")
-    age: float = _pv("FrameAge", "since the last frame came into the file", math.nan, "s")
-    skipped: int = _pv("SkippedLines", "lines of the log that are no events", 0)
+    data_rate: float = published("DataRate", "data a second", math.nan, "MB/s")
+    residual: float = published("ReconResidual", "of the views that the live volume has not learnt", math.nan)
+    skipped: int = published("SkippedLines", "lines of the log that are no events", 0)
 
 
 class Severity(IntEnum):
@@ -84,7 +58,7 @@ class StampedValues:
         began: stamp of what nothing has set yet.
     """
 
-    values: RunValues
+    values: ProcessVariables
     began: float
     stamps: Mapping[str, Stamp] = field(default_factory=dict)
 
@@ -193,15 +167,15 @@ class RunServer:
             ) from error
         self._runs, self._say, self._now = runs, say, now
         self._reader: Reader | None = None
-        self._values, self._lines, self._beats = StampedValues(RunValues(), now()), 0, 0
+        self._values, self._lines, self._beats = StampedValues(ProcessVariables(), now()), 0, 0
         self._asked: deque[tuple[Any, Any, Asked]] = deque()  # PVs whose clients wait, with their operations
         provider, self._shown = StaticProvider("splatline"), dict[str, Any]()
-        for each in fields(RunValues):
+        for each in fields(ProcessVariables):
             about = {"display.description": each.metadata["about"], "display.units": each.metadata["unit"]}
             kind = NTScalar(_TYPES[str(each.type)], display=True)
             initial = _posted(each.default, self._values.stamp(each.name))
             self._shown[each.name] = pv = SharedPV(nt=kind, initial={**initial, **about})
-            provider.add(prefix + each.metadata["pv"], pv)
+            provider.add(prefix + each.metadata["name"], pv)
         begun = Stamp(now())
         self._heartbeat = SharedPV(nt=NTScalar("l"), initial=_posted(0, begun))
         provider.add(prefix + "Heartbeat", self._heartbeat)
@@ -226,7 +200,7 @@ class RunServer:
         for _ in range(len(self._asked)):
             self._answer(*self._asked.popleft())
         now, before = self._read(), self._values
-        for each in fields(RunValues):
+        for each in fields(ProcessVariables):
             value, stamp = getattr(now.values, each.name), now.stamp(each.name)
             known = getattr(before.values, each.name)
             same = value == known or (value != value and known != known)  # NaN is not equal to itself
@@ -252,7 +226,7 @@ class RunServer:
             if self._reader is not None:
                 self._reader.close()
             self._reader, self._lines = Reader(what), 0
-            values = StampedValues(RunValues(), self._now())
+            values = StampedValues(ProcessVariables(), self._now())
         seen, why = None, ""
         try:
             seen = self._reader.state()

@@ -88,7 +88,7 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
 
     def init_device(device: Any) -> None:
         Device.init_device(device)
-        for name in ("State", "Status", *(each.metadata["attribute"] for each in fields(ScanAttributes))):
+        for name in ("State", "Status", *(each.metadata["name"] for each in fields(ScanAttributes))):
             device.set_change_event(name, True, False)
 
     body: dict[str, Any] = {
@@ -99,7 +99,7 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     }
     for each in fields(ScanAttributes):
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
-        body[each.metadata["attribute"]] = attribute(fget=reader(each.name), **facts)
+        body[each.metadata["name"]] = attribute(fget=reader(each.name), **facts)
     for name, taken, about in (
         ("LastView", run.last_view, "the newest frame: share of the light, or counts without references"),
         ("Slice", run.volume_slice, "the middle slice of the newest volume"),
@@ -205,7 +205,7 @@ def push_changes(device: Any, before: Any, now: Any) -> None:
             continue
         quality = getattr(AttrQuality, now.quality(name))
         value = list(value) if isinstance(value, tuple) else value
-        device.push_change_event(each.metadata["attribute"], value, now.time(name), quality)
+        device.push_change_event(each.metadata["name"], value, now.time(name), quality)
     if now.values.device_state != before.values.device_state:
         device.push_change_event("State", getattr(DevState, now.values.device_state), math.floor(time.time()),
                                  AttrQuality.ATTR_VALID)  # fmt: skip

@@ -11,47 +11,20 @@ from typing import Any
 
 from beamline.core.events import event_in
 from beamline.core.text import one_line
-from beamline.page.event_values import event_values
+from beamline.page.event_values import RunValues, event_values, published
 from beamline.scan.runs import DIED
 from beamline.scan.states import State
 
 _LONGEST = 1000  # characters of a text
 
 
-def _attribute(name: str, about: str, default: Any, unit: str = "") -> Any:
-    return field(default=default, metadata={"attribute": name, "about": about, "unit": unit})
-
-
 @dataclass(frozen=True)
-class ScanAttributes:
-    """The present values of a run; each field is an attribute of the device, with name, meaning and unit as metadata.
+class ScanAttributes(RunValues):
+    """The values of a run that are attributes of the device, by the names of the process variables (docs/epics.md)."""
 
-    Names are those of the process variables (docs/epics.md) where these have the same. Numbers are NaN or -1 where they
-    are not known.
-    """
-
-    run: str = _attribute("Run", "folder of the run", "")
-    sample: str = _attribute("SampleName", "name of the sample", "")
-    file: str = _attribute("FileName", "scan file", "")
-    state: str = _attribute("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done, died ...", "idle")
-    message: str = _attribute("Message", "what the scan said last", "")
-    planned: int = _attribute("ImagesPlanned", "frames that the scan takes in all", -1)
-    exposed: int = _attribute("ImagesCollected", "frames exposed", 0)
-    stored: int = _attribute("ImagesSaved", "frames in the file", 0)
-    percent: float = _attribute("PercentComplete", "of the frames planned", 0.0, "%")
-    rate: float = _attribute("FrameRate", "frames a second", math.nan, "Hz")
-    time_left: float = _attribute("RemainingTime", "until the last frame", math.nan, "s")
-    angle: float = _attribute("Angle", "of the newest frame in the file", math.nan, "deg")
-    mean: float = _attribute("MeanCounts", "of the newest frame", math.nan, "counts")
-    beam: float = _attribute("Beam", "last reading of the beam monitor", math.nan)
-    warnings: int = _attribute("Warnings", "flags of the monitor that warn", 0)
-    alarms: int = _attribute("Alarms", "flags of the monitor that are alarms", 0)
-    flag_names: tuple[str, ...] = _attribute("FlagNames", "checks of the monitor that flagged frames", ())
-    flag_counts: tuple[int, ...] = _attribute("FlagCounts", "flags of each of FlagNames", ())
-    last_flag: str = _attribute("LastFlag", "check, frame and advice of the last flag", "")
-    views: int = _attribute("ReconViews", "views in the live volume", 0)
-    free: float = _attribute("DiskFree", "of the disk with the scan file", math.nan, "GB")
-    age: float = _attribute("FrameAge", "since the last frame came into the file", math.nan, "s")
+    angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
+    flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
+    flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each of FlagNames", ())
 
     @property
     def device_state(self) -> str:

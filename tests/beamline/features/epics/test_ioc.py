@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.epics.ioc import RunServer, RunValues
+from beamline.features.epics.ioc import ProcessVariables, RunServer
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 thread = pytest.importorskip("p4p.client.thread")
@@ -115,7 +115,7 @@ def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> N
 def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path) -> None:
     begin = time.time()
     with _served(tmp_path, control=True) as (_, client):
-        named = [each.metadata["pv"] for each in fields(RunValues)]
+        named = [each.metadata["name"] for each in fields(ProcessVariables)]
         for name in [*named, "Heartbeat", "PauseScan", "ResumeScan", "StopScan", "AbortScan"]:
             assert begin <= client.get(f"T:{name}").timestamp <= time.time()
 

@@ -21,7 +21,7 @@ from beamline.core.events import (
 )
 from beamline.core.flag import Flag, Level
 from beamline.core.run_result import RunResult
-from beamline.features.epics.ioc import RunValues, Severity, Stamp, StampedValues
+from beamline.features.epics.ioc import ProcessVariables, Severity, Stamp, StampedValues
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
 FRAME = FrameStored(5, 20, "projection", 2.5, 40.0, 6.0, 812.0)
@@ -33,16 +33,16 @@ BEGAN = 100.0  # s
 def _stamped(*events: Event) -> StampedValues:
     """The values after events that are 1 s apart."""
     timed = (replace(event, time=1000.0 + number) for number, event in enumerate(events))
-    return StampedValues(RunValues(), BEGAN).after(event.to_json() for event in timed)
+    return StampedValues(ProcessVariables(), BEGAN).after(event.to_json() for event in timed)
 
 
-def _after(*events: Event) -> RunValues:
+def _after(*events: Event) -> ProcessVariables:
     return _stamped(*events).values
 
 
 def test_names_are_unique_and_said() -> None:
-    named = [each.metadata["pv"] for each in fields(RunValues)]
-    assert len(set(named)) == len(named) and all(each.metadata["about"] for each in fields(RunValues))
+    named = [each.metadata["name"] for each in fields(ProcessVariables)]
+    assert len(set(named)) == len(named) and all(each.metadata["about"] for each in fields(ProcessVariables))
 
 
 def test_every_kind_of_event_sets_its_values() -> None:
@@ -114,7 +114,7 @@ def test_severities(event: Event, name: str, severity: Severity) -> None:
 
 @pytest.mark.parametrize("name", ["planned", "rate", "beam", "residual", "free"])
 def test_a_value_that_is_not_known_is_invalid(name: str) -> None:
-    assert StampedValues(RunValues(), BEGAN).stamp(name) == Stamp(BEGAN, Severity.INVALID, "not known")
+    assert StampedValues(ProcessVariables(), BEGAN).stamp(name) == Stamp(BEGAN, Severity.INVALID, "not known")
 
 
 def test_a_scan_that_died_is_an_alarm_and_says_what_can_be_done() -> None:

@@ -144,7 +144,7 @@ def test_verbs_are_commands_only_with_control(tmp_path: Path) -> None:
         watching, controlling = (vars(device_class(run, control)) for control in (False, True))
     verbs = {verb.value.capitalize() for verb in Verb}
     assert not verbs & set(watching) and verbs <= set(controlling)
-    assert {each.metadata["attribute"] for each in fields(ScanAttributes)} <= set(watching)
+    assert {each.metadata["name"] for each in fields(ScanAttributes)} <= set(watching)
 
 
 _EVENTS = """

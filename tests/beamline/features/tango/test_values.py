@@ -39,7 +39,7 @@ def _flagged(check: str, level: str) -> Event:
 
 
 def test_names_are_unique_and_each_has_a_meaning() -> None:
-    named = [each.metadata["attribute"] for each in fields(ScanAttributes)]
+    named = [each.metadata["name"] for each in fields(ScanAttributes)]
     assert len(set(named)) == len(named) and all(each.metadata["about"] for each in fields(ScanAttributes))
 
 
