@@ -24,12 +24,13 @@ _DOUBLE = "sums variation means"  # of the tally
 _ARRAYS = (
     "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
     "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
-    "weights terms sums volume beam corner weight tv_weight rates vectors p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+    "weights terms sums volume beam corner weight tv_weight rates vectors "
+    "p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
 _PARTS = {
-    "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion", "axes_of",
-    "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
+    "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
+    "axes_of", "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
 }  # fmt: skip
 
 
