@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from recon.base.geometry import Geometry
@@ -12,12 +12,13 @@ from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StepPlan:
     """What stays the same from step to step.
 
     Attributes:
-        geometry: of the views. Only its detector and beam are read, which `optics` repeats for comparisons.
+        key: two plans of one fit with equal keys are the same.
+        geometry: of the views. Only its detector and beam are read.
         unit: 1/mm; densities are unit * softplus(raw).
         faint, cut: see `Pass.view`.
         views: of a step; their gradients are averaged.
@@ -29,7 +30,8 @@ class StepPlan:
         bounds: of the four parameters.
     """
 
-    geometry: Geometry = field(compare=False)
+    key: tuple[Any, ...]
+    geometry: Geometry
     kernel: Kernel
     rays: RayModel
     unit: float
@@ -42,11 +44,6 @@ class StepPlan:
     box_faint: float
     moves: bool
     bounds: tuple[tuple[float, float] | None, ...]
-    optics: tuple[Any, ...] = ()
-
-    def __post_init__(self) -> None:
-        g = self.geometry
-        object.__setattr__(self, "optics", (g.detector_shape, g.is_cone, g.sod, g.sdd, g.pixel_pitch, g.width))
 
 
 @dataclass(frozen=True, eq=False)

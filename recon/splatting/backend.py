@@ -124,8 +124,11 @@ class Backend(Protocol[Array]):
     def taken(self, array: Array, origin: NDArray[np.int64]) -> Array:
         """The rows `origin` of an array, zeros for -1."""
 
-    def fused_step(self, model: StepModel, plan: StepPlan) -> FusedStep | None:
-        """Whole steps without the host in between; None where the step is made operation by operation."""
+    def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> FusedStep | None:
+        """Whole steps without the host in between; None where the step is made operation by operation.
+
+        `earlier`: those of the fit before, of another model or plan.
+        """
 
 
 def backend_for(device: str) -> Backend[Any]:
@@ -177,7 +180,7 @@ class Cpu:
         rows[origin < 0] = 0
         return rows
 
-    def fused_step(self, model: StepModel, plan: StepPlan) -> None:
+    def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> None:
         return None
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +115,7 @@ def step(
         _draw(state, problem.geometry.n_views) if view is None or k else view for k in range(settings.views_per_step)
     ]
     weight = tv_weight(settings, problem, state.limit)
-    box = _random_box(state, problem, settings) if weight > 0 else None
+    box = _RandomBox.of(state, problem.grid, tv_size(settings, problem.grid)) if weight > 0 else None
     state.step += 1
     update = _Update.of(state, problem, settings, fraction)
     fused = _fused(state, problem, settings, update, box)
@@ -125,7 +125,7 @@ def step(
         images, maps, weights = (
             [arrays[k] for k in views] for arrays in (problem.images, problem.target_maps, problem.weights)
         )
-        corner, of_variation = (0.0, 0.0, 0.0) if box is None else box.first, weight * problem.half_field
+        corner, of_variation = (0.0, 0.0, 0.0) if box is None else box.first(problem.grid), weight * problem.half_field
         fused.run(
             StepInputs(problem.geometry, views, images, maps, weights, corner, of_variation, update.rates, state.step)
         )
@@ -137,6 +137,30 @@ def step(
     if policy is not None and state.step % policy.every == 0 and policy.start <= fraction < policy.stop:
         _grow(state, problem, policy)
     return state
+
+
+class _RandomBox(NamedTuple):
+    """The voxels on which a step's total variation acts: the first one (z, y, x), and their number along each axis.
+
+    A step takes no `Grid` of its own, whose checks take as long as a GPU takes for the step.
+    """
+
+    corner: tuple[int, ...]
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, state: FitState, grid: Grid, side: int) -> _RandomBox:
+        z, y, x = (min(side, n) for n in grid.shape)
+        corner = tuple(int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, (z, y, x), strict=True))
+        return cls(corner, (z, y, x))
+
+    def first(self, grid: Grid) -> tuple[float, float, float]:
+        """The centre (z, y, x) of its first voxel, mm."""
+        z, y, x = (f + c * edge for f, c, edge in zip(grid.first, self.corner, grid.spacing, strict=True))
+        return z, y, x
+
+    def grid(self, grid: Grid) -> Grid:
+        return grid.part(*(slice(c, c + n) for c, n in zip(self.corner, self.shape, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -159,25 +183,29 @@ class _Update:
 
 
 def _fused(
-    state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: Grid | None
+    state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
     """What makes whole steps of this state on the device, kept from step to step while nothing changes its plan."""
-    cut = settings.truncation
-    plan = StepPlan(
-        problem.geometry, state.kernel, settings.rays, 1 / problem.half_field, cut.faint, cut.sigmas,
-        settings.views_per_step, problem.loss, any(weights is not None for weights in problem.weights),
-        None if box is None else replace(box, centre=(0.0, 0.0, 0.0)), cut.faint / problem.half_field,
-        settings.tv_moves, update.bounds,
+    shape, before = None if box is None else box.shape, state.fused
+    key = (
+        problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
+        settings.tv_moves, update.bounds, shape, any(weights is not None for weights in problem.weights),
     )  # fmt: skip
-    before = state.fused
-    if before is not None and before.plan == plan and before.model.parameters[-1] is state.parameters[NAMES[-1]]:
+    raw = state.parameters[NAMES[-1]]
+    if before is not None and before.plan.key == key and before.model.parameters[-1] is raw:
         return before
     settle(state)
+    cut, small = settings.truncation, None if box is None else replace(box.grid(problem.grid), centre=(0.0, 0.0, 0.0))
+    plan = StepPlan(
+        key, problem.geometry, state.kernel, settings.rays, 1 / problem.half_field, cut.faint, cut.sigmas,
+        settings.views_per_step, problem.loss, key[-1], small, cut.faint / problem.half_field, settings.tv_moves,
+        update.bounds,
+    )  # fmt: skip
     parameters, first, second = (
         tuple(arrays[name] for name in NAMES) for arrays in (state.parameters, state.first, state.second)
     )
     model = StepModel(parameters, first, second, state.statistic, state.loss, state.residual)
-    state.fused = problem.backend.fused_step(model, plan)
+    state.fused = problem.backend.fused_step(model, plan, before)
     return state.fused
 
 
@@ -188,7 +216,8 @@ def settle(state: FitState) -> None:
 
 
 def _by_operations(
-    state: FitState, problem: FitProblem, settings: FitSettings, views: Sequence[int], box: Grid | None, weight: float,
+    state: FitState, problem: FitProblem, settings: FitSettings, views: Sequence[int], box: _RandomBox | None,
+    weight: float,
     update: _Update,
 ) -> None:  # fmt: skip
     """One step, operation by operation."""
@@ -207,7 +236,7 @@ def _by_operations(
         backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
         loss = loss + value / share  # type: ignore[operator]
     if box is not None:
-        loss = loss + _smooth(problem, settings, weight, run, box)
+        loss = loss + _smooth(problem, settings, weight, run, box.grid(problem.grid))
     state.loss = _running(state.loss, loss)
     parameters, first, second = (
         [arrays[name] for name in NAMES] for arrays in (state.parameters, state.first, state.second)
@@ -268,14 +297,6 @@ def _draw(state: FitState, n_views: int) -> int:
 def _running(mean: Any, value: Any) -> Any:
     # The first value is the mean; only a float can be the NaN of no value yet, so that a GPU need not be waited for.
     return value if isinstance(mean, float) and np.isnan(mean) else 0.95 * mean + 0.05 * value
-
-
-def _random_box(state: FitState, problem: FitProblem, settings: FitSettings) -> Grid:
-    """The voxels on which a step's total variation acts."""
-    grid, side = problem.grid, tv_size(settings, problem.grid)
-    size = tuple(min(side, n) for n in grid.shape)
-    corner = [int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, size, strict=True)]
-    return grid.part(*(slice(c, c + s) for c, s in zip(corner, size, strict=True)))
 
 
 def _smooth(problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any], box: Grid) -> Any:

@@ -67,8 +67,8 @@ class Gpu:
         kept[rows < 0] = 0
         return kept
 
-    def fused_step(self, model: StepModel, plan: StepPlan) -> GpuStep | None:
+    def fused_step(self, model: StepModel, plan: StepPlan, earlier: GpuStep | None) -> GpuStep | None:
         exact = plan.geometry.is_cone and plan.rays.exact_above < math.inf
         return (
-            None if exact else GpuStep(model, plan, self.device)
+            None if exact else GpuStep(model, plan, self.device, earlier)
         )  # the number of exact rays is only known on the host

@@ -9,6 +9,8 @@ interpreter) the same launches follow each other, and give the same bits.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 import triton
@@ -59,7 +61,8 @@ def _tally(
 class GpuStep:
     """Steps of one model by one plan, see `recon.kernels.fused_step.FusedStep`."""
 
-    def __init__(self, model: StepModel, plan: StepPlan, device: torch.device) -> None:
+    def __init__(self, model: StepModel, plan: StepPlan, device: torch.device, earlier: GpuStep | None) -> None:
+        """`earlier` steps of a model before density control tell how long lists become."""
         self.model, self.plan, self._device = model, plan, device
         lists, pixels = plan.views + (plan.box is not None), plan.geometry.detector_shape
         self._counts = torch.zeros(1 + lists, dtype=torch.int64, device=device)
@@ -72,9 +75,15 @@ class GpuStep:
         self._images = torch.zeros((plan.views, *pixels), device=device)
         self._maps = torch.zeros((plan.views, 2, *pixels), device=device)
         self._weights = torch.ones((plan.views, *pixels), device=device) if plan.weighted else None
+        self._expected = [0] * lists if earlier is None else earlier.lengths_for(model, lists)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._queued: list[StepInputs] = []
         self._beams: tuple[Geometry, dict[int, F32]] = (plan.geometry, {})
+
+    def lengths_for(self, model: StepModel, lists: int) -> list[int]:
+        """About the lengths of the lists of another number of Gaussians."""
+        more = len(model.statistic) / max(1, len(self.model.statistic))
+        return [math.ceil(more * (room.pairs or 0)) for room in self._rooms][:lists] + [0] * (lists - len(self._rooms))
 
     def run(self, inputs: StepInputs) -> None:
         """Queue one step."""
@@ -106,6 +115,8 @@ class GpuStep:
         self._load(inputs)
         if self._rooms[0].pairs is None:  # the first step counts the pairs, and compiles
             self._work()
+            for room, pairs in zip(self._rooms, self._expected, strict=True):
+                room.pairs = max(room.pairs or 0, pairs)
             self._prepare()
         elif interpreted():
             self._work()
