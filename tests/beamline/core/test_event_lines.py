@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from beamline.core.events import KINDS, LONGEST, event_in, event_of, whole_lines
-from beamline.features.epics.ioc import ProcessVariables, StampedValues
+from beamline.page.followed_run import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
 
@@ -59,8 +59,8 @@ def test_no_value_in_any_field_ends_who_reads_a_log(line: str) -> None:
     values = json.loads(line)
     for name in values:
         for junk in JUNK:
-            StampedValues(ProcessVariables(), 0.0).after([json.dumps({**values, name: junk})])
-        StampedValues(ProcessVariables(), 0.0).after([json.dumps({key: values[key] for key in values if key != name})])
+            StampedValues(RunValues(), 0.0).after([json.dumps({**values, name: junk})])
+        StampedValues(RunValues(), 0.0).after([json.dumps({key: values[key] for key in values if key != name})])
 
 
 @pytest.mark.parametrize(
