@@ -23,8 +23,6 @@ from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_
 from beamline.core.files import leads_away, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
-from beamline.storage.journal import pending
-from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
@@ -73,8 +71,6 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
-    if (changes := pending(path)) is not None:
-        return h5py.File(Overlay(path, changes.ranges), "r")
     problems, is_held = [], False
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
