@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
-from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
@@ -25,6 +23,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.progress import compilation_events, progress_events
 from beamline.reconstruct.region import RegionOfRows
+from beamline.reconstruct.run import run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from beamline.reconstruct.workers import cluster
 from drivers.base.clock import Clock
@@ -32,7 +31,6 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import (
     CheckpointedMethod,
-    DataUse,
     Method,
     Progress,
     Reconstruction,
@@ -131,27 +129,16 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
             warm_up(candidate, geometry, device=options.device, on_kernel=compiled)
 
 
-def run_on(
-    options: ReconOptions,
-    method: Method,
-    prepared: PreparedProjections,
-    grid: Grid,
-    control: RunControl,
-    reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
-) -> Reconstruction:
-    """Run a method on these views, with some held out if it takes any, until it ends or is stopped."""
-    data, geometry = prepared.projections.data, prepared.geometry
-    held_out: Sequence[int] = ()
-    if method.traits.held_out:
-        data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    # Rays that weigh nothing were filled on disk, as a direct method does it.
-    filled = method.traits.direct and prepared.on_disk
-    weights = None if filled else prepared.ray_weights(len(held_out))
-    with refused(options, f" by {method.name}"):
-        return reconstruct(
-            data, geometry, method, grid=grid, seed=options.seed, device=options.device,
-            use=DataUse(weights, held_out, prepared.emission, prepared.times, prepared.energies), control=control,
-        )  # fmt: skip
+def runner_of(
+    options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
+) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
+    """`run_on` with the seed and the device of the options; what a method refuses names the file."""
+
+    def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
+        with refused(options, f" by {method.name}"):
+            return run_on(method, prepared, grid, options.seed, control, options.device, reconstruct)
+
+    return run
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
@@ -233,7 +220,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
         now=job.channels.clock.now,
         decide=decided if options.uncertainty else None,
     )
-    result = run_on(options, method, prepared, job.grid, control)
+    result = runner_of(options)(method, prepared, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
     chosen, started_from = "", int(result.settings.get("gaussians_at_start", 0))
@@ -262,9 +249,9 @@ def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
     with nullcontext() if options.cluster is None else cluster().connected(options.cluster) as connected:
         workers = None
         if connected is not None:
-            workers = SlabWorkers(connected.workers, partial(run_on, options, reconstruct=connected.reconstruct))
+            workers = SlabWorkers(connected.workers, runner_of(options, connected.reconstruct))
         result = in_slabs(
-            partial(run_on, options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
+            runner_of(options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
         )
     return _recorded(result, job.stop.stopped)
 
