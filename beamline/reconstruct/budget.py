@@ -209,5 +209,5 @@ def _named(choice: Choice, result: Reconstruction | None = None) -> str:
     if result is not None and result.history:
         text += f", {result.history[-1].step} {choice.counted}"
     if result is not None and choice.is_gaussian_fit:
-        text += f" from {result.settings['gaussians_at_start']} Gaussians"
+        text += f" from {result.started_from} Gaussians"
     return text + (f", binned {choice.binning} x {choice.binning}" if choice.binning > 1 else "")

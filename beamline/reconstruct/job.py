@@ -30,7 +30,9 @@ from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import (
+    BoundedMethod,
     CheckpointedMethod,
+    Ending,
     Method,
     Progress,
     Reconstruction,
@@ -156,23 +158,15 @@ def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPro
     return made, prepared
 
 
-def _recorded(
-    result: Reconstruction, early: bool, chosen: str = "", settings: Mapping[str, Any] | None = None
-) -> Reconstruction:
-    """The result with what the record says of it: what was chosen, by whom, `settings`, and whether it ended early.
-
-    It goes without what only a next run, or a comparison, needs.
-    """
-    ended = {"ended_early": True} if early else {}
-    because = result.settings.get("chosen_because")
-    chosen = chosen or ("" if because is None else f"{result.method}: {because}")
-    settings = {**result.settings, **(settings or {}), **ended}
-    return replace(result, chosen=chosen, settings=settings, checkpoint=None, at=None)
+def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstruction:
+    """The result with how it ended, and what was chosen, without what only a next run, or a comparison, needs."""
+    chosen = chosen or (result.chosen and f"{result.method}: {result.chosen}")
+    return replace(result, chosen=chosen, ending=ending, checkpoint=None, at=None)
 
 
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
     """The volume with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
-    if "ended_early" in made.settings:
+    if made.ending.early:
         job.channels.warn("The error bars were left out, as the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
@@ -214,7 +208,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
     control = RunControl(
         job.stop,
-        job.listener(getattr(method, "seconds", None)),
+        job.listener(method.seconds if isinstance(method, BoundedMethod) else None),
         None if checkpoints.path is None else keep,
         resume=resume,
         now=job.channels.clock.now,
@@ -223,10 +217,11 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     result = runner_of(options)(method, prepared, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
-    chosen, started_from = "", int(result.settings.get("gaussians_at_start", 0))
-    asked = getattr(method, "gaussians", None) if options.quality is None else None
-    if options.quality is not None:
-        chosen = f"{options.quality}: {getattr(method, 'steps', None)} steps from {started_from} Gaussians"
+    chosen, started_from, asked = "", result.started_from, None
+    if isinstance(method, FitMethod) and options.quality is not None:
+        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
+    elif isinstance(method, FitMethod):
+        asked = method.gaussians
     if isinstance(asked, int) and resume is None and started_from < asked:
         job.channels.warn(
             f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more."
@@ -237,8 +232,8 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
     finishes = method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
     early = job.stop.stopped if finishes else job.stop.cut(reached, planned)
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return _recorded(result, early, chosen, resumed | ({"checkpoint_lost": lost} if lost else {}))
+    resumed_from = "" if checkpoints.resume is None else str(checkpoints.resume)
+    return _ended(result, Ending(early, resumed_from, lost), chosen)
 
 
 def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
@@ -253,7 +248,7 @@ def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
         result = in_slabs(
             runner_of(options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
         )
-    return _recorded(result, job.stop.stopped)
+    return _ended(result, replace(result.ending, early=job.stop.stopped))
 
 
 def _within_budget(job: Job, budget: float) -> tuple[Reconstruction, PreparedProjections]:
@@ -262,4 +257,4 @@ def _within_budget(job: Job, budget: float) -> tuple[Reconstruction, PreparedPro
     control = RunControl(job.stop, job.listener(budget), now=job.channels.clock.now)
     with refused(job.options):
         made, prepared = within(budget, job.prepared, methods, job.options.seed, control, job.channels.warn, largest)
-    return _recorded(made, job.stop.stopped, made.chosen), prepared
+    return _ended(made, Ending(job.stop.stopped), made.chosen), prepared
