@@ -23,7 +23,7 @@ from beamline.core.text import count, frames_text
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import PlaceStep, ScanStep
+from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
 from beamline.projections.refusals import checked_views, correction_blockers, refuse
 from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
@@ -288,9 +288,8 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if usable.jumps.size and any(
-            getattr(step, "corrects_jumps", False) for step in in_order(self._options.selection)
-        ):
+        steps = in_order(self._options.selection)
+        if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."

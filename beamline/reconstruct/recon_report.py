@@ -130,7 +130,7 @@ def _footnotes(
             "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
             "the scan."
         )
-    if "resumed_from" in made.settings:
+    if made.ending.resumed_from:
         footnotes.append(
             f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before."
         )

@@ -288,7 +288,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
         "device": problem.device, "finish": sweeps, "volume_by": made_by, "joined_pixels": views.joined,
         "tv_weight": tv_weight(settings, run.fitting, state.limit), "tv_size": tv_size(settings, views.field),
     }  # fmt: skip
-    return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last))
+    return Reconstruction(volume, record, tuple(run.history), model, run.checkpoint(last), started_from=n_start)
 
 
 def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:

@@ -18,7 +18,7 @@ from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
-from beamline.reconstruct.job import compile_kernels, run_on
+from beamline.reconstruct.job import compile_kernels, runner_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import progress_events
@@ -168,7 +168,7 @@ def swept_slice(
 ) -> Reconstruction:
     compile_kernels(options, prepared.geometry, sink, clock)
     control = RunControl(on_progress=progress_events(sink, clock), now=clock.now)
-    return run_on(options, options.method_for(prepared.geometry), prepared, grid, control)
+    return runner_of(options)(options.method_for(prepared.geometry), prepared, grid, control)
 
 
 def middle_axis(selections: Sequence[Selection]) -> float | None:

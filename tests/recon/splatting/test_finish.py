@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl
+from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
@@ -211,7 +211,7 @@ def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(
     """A chequered box, sharp to the voxel; the fit of a trial is ten times as dense, which no sweeps mend."""
     data = Projector(VIEWS, GRID).forward(_box()) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
 
-    def poor(part: ReconProblem, *_: object) -> MethodResult:
+    def poor(part: ReconProblem, *_: object) -> Reconstruction:
         fitted = R2(steps=5, gaussians=50, finish=0).run(part, RunControl())
         fitted.volume.data[...] *= 10
         return fitted
