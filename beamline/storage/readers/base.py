@@ -321,10 +321,12 @@ class Opening:
     Attributes:
         follow: the file may still be growing.
         own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
+        one_series: the caller says the kind of each frame; names of files say none.
     """
 
     follow: bool = False
     own_angles: bool = True
+    one_series: bool = False
 
 
 @dataclass(frozen=True)

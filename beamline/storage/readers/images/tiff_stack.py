@@ -13,7 +13,15 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
+from beamline.storage.readers.tiff import (
+    SUFFIXES,
+    UNREADABLE,
+    Complaints,
+    appended,
+    pages_one_by_one,
+    refuse_packed,
+    refuse_volume,
+)
 from drivers.base.frame import FrameKind
 
 MANY_PAGES = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
@@ -50,6 +58,7 @@ class TiffStackSource(ScanSource):
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
+        refuse_packed(self._tif)
         if len(self._tif.pages) > MANY_PAGES and appended(self._tif):
             first = self._tif.pages.first
             self.shape, self.dtype = (int(first.imagelength), int(first.imagewidth)), np.dtype(first.dtype)
