@@ -26,8 +26,9 @@ from beamline.core.files import TEXT, decoded
 from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.ending import ScanEnding
 
@@ -69,6 +70,10 @@ class TiffSeriesSource(ScanSource):
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return offered(self)
 
     @property
     def ending(self) -> ScanEnding:

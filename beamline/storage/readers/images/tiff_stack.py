@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
     SUFFIXES,
     UNREADABLE,
@@ -80,6 +81,10 @@ class TiffStackSource(ScanSource):
         if one_by_one:
             return len(self._tif.pages)
         return 1 if len(series.shape) == 2 else int(series.shape[0])
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return offered(self)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

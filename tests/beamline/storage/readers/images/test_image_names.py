@@ -92,7 +92,8 @@ def test_other_numbers_in_names_are_no_angles() -> None:
     "pattern",
     [
         "s_{i:06d}_img.tif", "scan_{i:04d}.ome.tif", "{i:04d}_scan.tif", "scan_{i:04d}_20keV.tif",
-        "scan_{i:04d}(1).tif", "scan ({i}).tif", "scan_{i}_20240101_1200{i:02d}.tif", "run2_{i:04d}_{date}.tif", "sub3/{i}_bin2.tif",
+        "scan_{i:04d}(1).tif", "scan ({i}).tif", "scan_{i}_20240101_1200{i:02d}.tif", "run2_{i:04d}_{date}.tif",
+        "sub3/{i}_bin2.tif",
     ],
 )  # fmt: skip
 def test_the_number_of_an_image_stands_anywhere_in_its_name(tmp_path: Path, pattern: str) -> None:
