@@ -19,6 +19,7 @@ from beamline.storage.readers.angle_table import Angles, load_angles, parse_angl
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.nexus import find
+from beamline.storage.readers.no_data import MarkedSource, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
@@ -181,6 +182,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     elif side is not None and side.white is not None and base.dtype.kind in "ui":
         flats = np.full((1, *base.shape), side.white, base.dtype) if flats is None else flats
         darks = np.zeros((1, *base.shape), base.dtype) if darks is None else darks
+    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
+        base = marked = MarkedSource(base, no_data)
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and marked.counter else darks
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
     angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
     if any(given is not None for given in (angles_of_all, darks, flats, quantity)):

@@ -161,7 +161,7 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The one maker's file in or beside a folder of images or a TIFF that is of as many projections, if there is one."""
+    """The maker's file in or beside a folder of images, or a TIFF, if one alone is of as many projections."""
     if not source.format.startswith("tiff"):
         return None
     views, found = int((source.image_key == FrameKind.PROJECTION).sum()), []

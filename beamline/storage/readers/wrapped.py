@@ -29,6 +29,7 @@ class WrappedSource(ScanSource):
         self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
         self.cone, self.axis_col, self.row_pitch_mm = base.cone, base.axis_col, base.row_pitch_mm
         self.in_order, self.numbers, self.frames_per_view = base.in_order, base.numbers, base.frames_per_view
+        self.pixel_mask = base.pixel_mask
 
     def _update(self) -> None:
         """Take over the present frames of `base`."""
