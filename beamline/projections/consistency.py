@@ -7,14 +7,22 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
+from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.references import ReferenceCheck
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
 from beamline.projections.truncation import cut_sides
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.light import light_beside_flats
+from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, median_deviation
+from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.voxels.view_weights import covers_the_circle
 
 _VIEWS = 180  # more do not sharpen the moments, they only cost reading
+_COLUMN_VIEWS = 32  # whose columns are looked at
 _LEAST_VIEWS, _LEAST_ROWS = 12, 8  # with fewer rows nobody knows how much they disagree
 _HALF_A_PIXEL = 0.5  # doubles edges as far as the resolution, as for the monitor's `opposite`
 _MOST_OF_THEM = 5, 95  # percent of views: one that a crumb crosses does not count
@@ -41,7 +49,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     few = len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS or selection.rows is not None
     if not whole or few or prepared.measured is not None or prepared.emission is not None:
         return
-    some = np.unique(np.linspace(0, len(data) - 1, min(len(data), _VIEWS)).astype(int))
+    some = _evenly(len(data), _VIEWS)
     if cut_sides(data, geometry) or _air_is_off(data, some):
         return
     shown = moments_of((data[view] for view in some), geometry.angles[some], geometry.axis_col)
@@ -63,6 +71,39 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     )
     for sentence in filter(None, sentences):
         warn(sentence)
+
+
+def compare_with_flats(
+    source: ScanSource, selection: Selection, projections: Projections, warn: Warn, *, refused: bool = True
+) -> None:
+    """Warn of views that are not of the light of their flats.
+
+    Args:
+        refused: a difference that no beam has is an error.
+
+    Raises:
+        DataError: such a difference, and the references are checked.
+    """
+    if source.quantity != "counts" or not len(projections.data):
+        return
+    accepted = selection.step(ReferenceCheck).accepted
+    said = selection.step(Air).model != "auto"  # columns that are said to be air
+    groups = groups_taken(source) if accepted else reference_groups(source).good()
+    if not (groups.darks and groups.flats):
+        return
+    if any(projections.air_columns):
+        level = -float(np.log(np.median(projections.air)))
+    else:
+        columns = [np.median(projections.data[view], axis=0) for view in _evenly(len(projections.data), _COLUMN_VIEWS)]
+        level = float(np.median(columns, axis=0).min())
+    air = any(projections.air_columns)
+    for finding in light_beside_flats(source, groups, level, air, accepted or said or not refused):
+        refuse(source, [finding])
+        warn(finding.message)
+
+
+def _evenly(n: int, most: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
 
 
 def _air_is_off(data: F32, some: NDArray[np.intp]) -> bool:
