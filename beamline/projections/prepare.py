@@ -121,7 +121,7 @@ def prepare_projections(
         check(view_geometry.of(used))
     phases.enter("correction")
     projections = _corrected(source, correction, used, buffer, phases)
-    compare_with_flats(source, selection, projections, warn)
+    light = compare_with_flats(source, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     geometry, place = view_geometry.of(projections.view_ids), (view_geometry.axis_col, axis)
     prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
@@ -129,7 +129,7 @@ def prepare_projections(
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
-    warn_of_inconsistency(prepared, selection, warn)
+    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 
