@@ -20,6 +20,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
+from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
@@ -325,6 +326,7 @@ class ScanFollower:
         selection, projections = self._options.selection, self._joined()
         geometry, seen = self.views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
+        compare_with_flats(self.source, selection, projections, self._warn, refused=False)
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}
         for step in in_order(selection):
