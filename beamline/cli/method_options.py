@@ -216,7 +216,7 @@ method_options = together(
         type=POSITIVE,
         help="Time of the whole call, instead of --steps: the fit gets what reading, correction, report and writing "
         "leave, which it does not shorten. If that is nothing, a warning says when the call will end. With --follow: "
-        "of the fit after the end of the scan.",
+        "most time after the end of the scan.",
     ),
     run_option(
         "--budget",

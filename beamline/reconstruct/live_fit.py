@@ -309,7 +309,11 @@ class ScanFollower:
                 self.write_snapshot()
                 last = self._clock.now()
 
-        self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=last))
+        message = (
+            f"The last round of the fit: {self._fit.last_steps} steps over all {count(self._fit.n_views, 'view')}, "
+            f"then sweeps on voxels; {seconds:g} s at most. A stop takes the volume as it is by then"
+        )
+        self._sink(StateEntered("finishing", message, time=last))
         return LastRound(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)
 
     def _joined(self) -> Projections:
