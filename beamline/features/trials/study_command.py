@@ -13,6 +13,7 @@ import click
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
+    WholeRange,
     MethodChoice,
     NameChoice,
     dry_option,
@@ -72,7 +73,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=click.IntRange(min=1, max=100),
+        type=WholeRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",

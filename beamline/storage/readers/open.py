@@ -34,6 +34,7 @@ from beamline.storage.readers.wrapped import (
     UnsignedSource,
     type_wrapped,
 )
+from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.registry import Registry, in_folders
 
@@ -271,16 +272,31 @@ def _open(path: Path, opening: Opening) -> ScanSource:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
     if not hdf5.is_hdf5(path):
+        saved = path.suffix == ".npz" and ", but arrays saved by Python: `beamline view` shows a volume of these"
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm; a scan is one of these, or a folder or .zip of TIFFs."
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm{saved or ''}; a scan is one of these, or a folder or .zip "
+            "of TIFFs."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        held = datasets_text(file)
+        held, is_volume = datasets_text(file), hdf5.text_at(file, "entry/definition") == "NXtomoproc"
+    if is_volume:
+        with opened_reconstruction(path) as record:
+            made_by = record.method or "another program"
+        raise DataError(
+            f"{path} is a volume, made by {made_by}, not a scan: `beamline view {path}` shows it, and `beamline "
+            "export` writes it in another format."
+        )
     raise DataError(
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
     )
+
+
+def scan_format(path: Path) -> str | None:
+    """The name of the format of a scan that an HDF5 file holds; None: of none."""
+    with hdf5.readable(path):
+        return next((kind.name for kind in FORMATS if kind.recognises(path, Opening())), None)
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:
