@@ -23,7 +23,7 @@ def config() -> None:
 def init(instrument: bool, file: str | None) -> None:
     """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
     if file is not None:
-        raise click.UsageError(f"config init prints the configuration and writes no file: beamline config init > {file}")
+        raise click.UsageError(f"config init prints a configuration and writes no file: beamline config init > {file}")
     from beamline.config.load import config_folder
 
     name = "instrument.yaml" if instrument else "simulated.yaml"
