@@ -190,13 +190,8 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
         Picture(
             "Slices",
             "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
-            "viewers. All share one grey window (1st to 99.5th percentile).",
+            "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
             figures.orthogonal_slices(shown, unit, kind),
-        ),
-        Picture(
-            "Slices, low contrast",
-            "The same slices, brighter: the 2nd to 90th percentile, for weak matter; fewer streaks are better.",
-            figures.orthogonal_slices(shown, unit, kind, (2.0, 90.0)),
         ),
         Picture(
             "Sharpest edge, and values",

@@ -26,6 +26,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
+from recon.base.greys import matter_window
 from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
@@ -164,7 +165,7 @@ def volume_rows(
 
 def _slice_panels(images: Sequence[F32], at: Sequence[float], pixel: float, unit: str) -> list[_Panel]:
     """Slices across z, y and x at these places, in the same greys."""
-    window = grey_window(images)
+    window = matter_window(*images)
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
     notes = (grey, "the same greys and scale", "the same greys and scale")

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from beamline.core.voxel_kind import VoxelKind
 from recon.base.geometry import Geometry
+from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.voxels.view_weights import Wedge
 
@@ -110,7 +111,6 @@ def orthogonal_slices(
     volumes: Mapping[str, Volume],
     unit: str,
     kind: VoxelKind = VoxelKind.ATTENUATION,
-    percentiles: GreyWindow = (1.0, 99.5),
 ) -> bytes:
     """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
 
@@ -120,7 +120,6 @@ def orthogonal_slices(
         volumes: by name, all on the same grid.
         unit: of length.
         kind: what the voxels are.
-        percentiles: of all the values shown, which become black and white.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -129,7 +128,7 @@ def orthogonal_slices(
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
-    window = grey_window([image for images in slices.values() for image in images], *percentiles)
+    greys = matter_window(*(image for images in slices.values() for image in images))
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
     column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
@@ -139,7 +138,7 @@ def orthogonal_slices(
         for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
             axes = panels[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
-            shown = show_grey(axes, image, window, (*h_edges, *v_edges), stretched=thin)
+            shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
             axes.tick_params(labelsize=7)
             axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
@@ -251,7 +250,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     at, grid = bright_centre(volume.data)[0], volume.grid
     figure, axes = _figure((6.4, 5.4))
     edges = planes(grid)[0][2:]
-    show_grey(axes, volume.data[at], grey_window([volume.data[at]]), (*edges[0], *edges[1]))
+    show_grey(axes, volume.data[at], matter_window(volume.data[at]), (*edges[0], *edges[1]))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
         first, last = wedge.rays
@@ -278,7 +277,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = V
     panels = ((volume, kind.value, "gray"), (deviation, "standard deviation", "magma"))
     for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
         image = shown.data[at]
-        low, high = grey_window([image], 0.5, 99.5)
+        low, high = matter_window(image) if shown is volume else grey_window([image], 0.5, 99.5)
         drawn = axes.imshow(image, cmap=colours, extent=extent, vmin=low, vmax=high, interpolation="nearest")
         left, top = extent[0] + length / 4, extent[3] + length / 4
         axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")

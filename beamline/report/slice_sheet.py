@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from beamline.report.figures import WIDTH, bright_centre, dpi_for, grey_window, png
+from beamline.report.figures import WIDTH, bright_centre, dpi_for, png
 from recon.base.arrays import F32
+from recon.base.greys import matter_window
 
 _COLUMNS = 4
 
@@ -40,7 +41,7 @@ class SliceSheet:
         """These slices, four beside one another, in the grey window of the first."""
         from matplotlib.figure import Figure
 
-        low, high = grey_window([self._shown[labels[0]]])
+        low, high = matter_window(self._shown[labels[0]])
         rows, cols = self._shown[labels[0]].shape
         head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
         # One image: a panel for each slice takes ten times as long to draw.

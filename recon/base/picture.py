@@ -11,10 +11,11 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.greys import matter_window
+
 U8 = NDArray[np.uint8]
 _SIDE = 256  # pixels of a slice's longer side, at most
 _GAP = 4  # pixels between slices
-_SEEN = (0.5, 99.8)  # percentiles shown black and white
 
 
 def html(title: str, pixels: U8, facts: Mapping[str, str]) -> str:
@@ -48,15 +49,15 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
     parts = [np.asarray(part, np.float64) for part in slices]
     values = np.concatenate([part[np.isfinite(part)] for part in parts])
-    low, high = np.percentile(values, _SEEN) if values.size else (0.0, 0.0)
+    low, high = matter_window(values)
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
     left = 0
     for part in parts:
         with np.errstate(invalid="ignore"):
-            grey = 255 * np.clip((part - low) / (high - low if high > low else 1.0), 0, 1)
+            grey = 255 * np.clip((part - low) / (high - low), 0, 1)
         sheet[: len(part), left : left + part.shape[1]] = np.nan_to_num(grey).astype(np.uint8)
         left += part.shape[1] + _GAP
-    return sheet, (float(low), float(high))
+    return sheet, (low, high)
 
 
 def fan(angles: NDArray[np.float64], centre: float) -> U8:

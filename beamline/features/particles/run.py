@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
 from beamline.core.shipped import version
-from beamline.report.figures import downwards, grey_window, png, show_grey
+from beamline.report.figures import downwards, png, show_grey
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import axes_of
 from beamline.storage.volumes.files import whole_volume
 from beamline.storage.writers.recon_file import DEVIATION
+from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.features.particles.particles import (
     NECK,
@@ -271,7 +272,7 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     ratios = (2 * column * y.size / x.size + 0.8, 2.4)
     upper, lower = np.ravel(figure.subfigures(2, 1, squeeze=False, height_ratios=ratios))
     panels = upper.subplots(2, _SLICES, sharex=True, sharey=True)
-    window = grey_window([volume.data[at]])
+    window = matter_window(volume.data[at])
     # Neighbours in the order of labels get different colours; the same colour comes again after twelve.
     colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
     for column_of, k in zip(panels.T, at, strict=True):

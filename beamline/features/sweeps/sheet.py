@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from beamline.features.sweeps.sweep import Scores, SweptSlice
 from beamline.features.sweeps.values import SweptOption
-from beamline.page.volume import grey_windows
 from beamline.report.figures import DPI, WIDTH, png, show_grey
+from recon.base.greys import matter_window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ def sweep_sheet(
     down = -(-len(slices) // across)
     part = _changes_most([each.image for each in slices])
     images = [each.image[part] for each in slices]
-    window = grey_windows(np.concatenate([image.ravel() for image in images]))["matter"]
+    window = matter_window(*images)
     tall, wide = images[0].shape
     height = WIDTH / across * tall / wide + 0.42
     curve = _CURVE if scores is not None and len(options) == 1 else 0.0
