@@ -15,15 +15,6 @@ from __future__ import annotations
 ONE_IN = 8
 """One of so many views is held out. Without views held out: -2 dB on a texture, whose weight follows the noise."""
 
-COARSE = 1.2
-"""Pixels a voxel, from which on voxels cannot explain the edges of views. Without: -10.0, -6.7 dB on two cones."""
-
-ALIKE = 0.03
-"""Of the least residual: within it the strongest prior is taken where voxels are coarse. Without: -0.5, -2.4 dB."""
-
-OF_MATTER = 0.1
-"""Of the largest line integrals: rays of a cone above it judge, by the median. Without: -0.6 dB on a teapot."""
-
 ENOUGH_MATTER = 0.5
 """Of the matter in the fullest rows, that the middle of a cone must hold. Without: air would judge; not measured."""
 

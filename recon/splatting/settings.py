@@ -100,17 +100,8 @@ def in_steps(settings: FitSettings, steps: float) -> FitSettings:
     Its rates fall with their square root. So does the least weight of total variation, which a short fit needs to be
     smooth.
     """
-    share = share_of_prior(settings, steps)
+    share = min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
     return replace(settings, pace=share * settings.pace, tv_least=share * settings.tv_least)
-
-
-def share_of_prior(settings: FitSettings, steps: float) -> float:
-    """The share of its prior, and of its sweeps, that the finish of so long a fit keeps where voxels are coarse.
-
-    Views held out choose the prior for volumes that begin at FBP, and too heavy where voxels are coarse. A longer fit
-    has explained more, and a whole finish takes it away: 3.8 dB of a teapot after 1600 steps (docs/choosing.md).
-    """
-    return min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
 
 
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:

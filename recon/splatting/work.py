@@ -15,7 +15,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_method
 from recon.splatting.settings import FitSettings, growth
 from recon.voxels.direct import direct_work
-from recon.voxels.held_out import LEAST_VIEWS, is_coarse
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
@@ -33,10 +33,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     """The work of `train.run_fit`."""
     if method.planned_steps is None:
         return Costs({method.name: Work.of(CLOCK, method.seconds or 0.0)})
-    weight, patches = (
-        weight_choice(geometry, grid),
-        Work() if is_coarse(geometry, grid) else patch_choice(geometry, grid),
-    )
+    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid)
     fit = _fit(method, geometry, grid, method.planned_steps)
     if not method.by_content or geometry.n_views < LEAST_VIEWS:
         if method.finish_sweeps == 0:
@@ -92,7 +89,7 @@ def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
     """The refinement on voxels, with steps of sparse patches where these may follow."""
     refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS)) + _rendered(method, geometry, grid)
     refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
-    if method.finish is not None or is_coarse(geometry, grid):
+    if method.finish is not None:
         return refined
     return refined + patch_steps(geometry, grid, PnpDct().iterations)
 

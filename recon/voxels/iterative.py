@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -23,6 +23,7 @@ from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
+from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import VoxelProblem
 
 UNITS = "units"  # name of the decision on them
@@ -110,16 +111,18 @@ def solve(
     decide = decide or Decisions()
     units = _Units(*decide(UNITS, lambda: _Units.of(projector, data, rays)))
     inside = units.enter(projector, data, rays, lines)
+    at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
 
     problem = VoxelProblem(
         inside,
-        data,
+        at_voxels,
         rays,
         nonnegative,
         np.random.default_rng(decide.seed),
         lambda iteration, residual: not watch.on_iteration(iteration, residual),
         decide,
         lambda: not watch.on_trial(),
+        measured=None if at_voxels is data else data,
     )
     threads = get_num_threads()
     try:
@@ -197,7 +200,8 @@ class _Units(NamedTuple):
         views, box = projector.geometry, projector.grid
         edge, slices = (math.ldexp(n, -self.length) for n in (box.voxel_size, box.spacing[0]))
         z, y, x = (math.ldexp(n, -self.length) for n in box.centre)
-        return Projector(views.scaled(math.ldexp(1.0, -self.length)), Grid(box.shape, edge, (z, y, x), slices))
+        grid = Grid(box.shape, edge, (z, y, x), slices)
+        return replace(projector, geometry=views.scaled(math.ldexp(1.0, -self.length)), grid=grid)
 
 
 def _times_power(array: F32, power: int) -> F32:

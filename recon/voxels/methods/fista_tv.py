@@ -67,13 +67,13 @@ class FistaTv:
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.iterations, trial)
         else:
-            share = self.tv_weight
-            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(projector, problem.weight))
+            share, plain = self.tv_weight, projector.plain
+            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(plain, problem.weight))
         subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
         if self.tv_weight is None and unit > 0:
             used = weight.value if isinstance(weight, NoiseBalance) else weight
-            problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used * subsets.step / len(subsets.views) / unit))
+            problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
     def toy(self) -> Self:
