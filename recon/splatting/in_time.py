@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
-from recon.splatting.finish import SUBSETS, TV_STEPS
+from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize

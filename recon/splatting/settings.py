@@ -15,7 +15,6 @@ from recon.base.empirical import (
     TV_MOST,
     TV_OF_NOISE,
     TV_SHARE,
-    TV_WIDEST,
     VIEWS_A_STEP,
 )
 from recon.base.kernel import Kernel
@@ -24,6 +23,12 @@ from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
+
+MODEL_STEPS = 50
+"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
+
+TV_WIDEST = 96
+"""Voxels of that side, at most. Without: a step in 512³ voxels takes longer; not measured."""
 
 NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.empirical import MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
@@ -47,7 +46,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
-from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
+from recon.splatting.settings import MODEL_STEPS, FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxelize
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods.fista_tv import FistaTv

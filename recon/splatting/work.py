@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 from recon.assess.plans import Speeds
-from recon.base.empirical import FINISH_SWEEPS, FIRST_SHARE, TRIAL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import CLOCK, Costs, Rates, Work
-from recon.splatting.finish import SUBSETS, TV_STEPS
+from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_method
@@ -19,6 +18,7 @@ from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.pnp_dct import TRIAL_STEPS
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient

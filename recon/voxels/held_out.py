@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
-from recon.base.empirical import AIR, BESIDE_MATTER, ENOUGH_MATTER, ONE_IN, TRIAL_SWEEPS
+from recon.base.empirical import ENOUGH_MATTER, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
@@ -27,6 +27,15 @@ from recon.voxels.projector import Projector
 from recon.voxels.resolution import Resolution, as_voxels_see
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
+
+TRIAL_SWEEPS = 16
+"""Sweeps of total variation. Without, after 8, a weight twice as heavy seems best: -0.8 to -2.9 dB on a teapot."""
+
+AIR = 0.03
+"""Of the largest line integral: trials leave out columns below it. Without: a tooth takes 129 for 55 CPU s."""
+
+BESIDE_MATTER = 0.05
+"""Of the width of the matter: air on either side that they keep, so that no matter is cut at the edge."""
 
 LEAST_VIEWS = 2 * ONE_IN
 

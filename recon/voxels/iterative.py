@@ -20,7 +20,7 @@ from numba import get_num_threads, set_num_threads
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.resolution import smoothed
@@ -45,13 +45,15 @@ class IterativeMethod(Protocol):
 
 @runtime_checkable
 class PreparedMethod(IterativeMethod, Protocol):
-    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations.
-
-    `trial_sweeps`: sweeps of all of its trials, as a rule.
-    """
+    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations."""
 
     @property
     def first_sweeps(self) -> int: ...
+
+
+@runtime_checkable
+class ChoosingPrior(IterativeMethod, Protocol):
+    """An iterative method whose trials choose its prior; `trial_sweeps`: those of all trials, as a rule."""
 
     @property
     def trial_sweeps(self) -> int: ...
@@ -144,6 +146,18 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     history: list[Progress] = []
     planned = method.iterations + (method.first_sweeps if isinstance(method, PreparedMethod) else 0)
 
+    trials, trial = method.trial_sweeps if isinstance(method, ChoosingPrior) else 0, 0
+
+    def on_trial() -> bool:
+        nonlocal trial
+        trial += 1
+        if control.on_progress is not None:
+            nan, of = math.nan, max(trials, trial)
+            control.on_progress(
+                Progress(trial, of, control.now() - begin, nan, nan, 0, geometry.n_views, unit=SWEEPS_OF_TRIALS)
+            )
+        return control.stop_of_trials()
+
     def report(iteration: int, residual: float) -> bool:
         seconds = control.now() - begin
         history.append(Progress(iteration, planned, seconds, residual, residual, 0, geometry.n_views))
@@ -157,7 +171,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     volume = solve(
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        watch=Watch(report, control.stop_of_trials), decide=decide,
+        watch=Watch(report, on_trial), decide=decide,
     )  # fmt: skip
     chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
     return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))

@@ -16,6 +16,9 @@ from recon.voxels.resolution import smoothed
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
+TRIAL_STEPS = 15
+"""Steps with patches. Without, with all 35: level within 0.1 dB, and half as much CPU time again."""
+
 STEPS = 5
 """Steps towards the views between two thresholds."""
 

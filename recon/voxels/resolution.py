@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
+from recon.base.empirical import SHARPENED
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.spread import spread
 
-_SHARE = 0.75  # of the excess, that the model makes up for
 _MOST = 1 / 6  # px² of excess that voxels as wide as pixels have; what coarser ones have beyond it, views lose
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _NOTHING = 1e-9  # px²: rounding
@@ -76,7 +76,7 @@ class Resolution:
     @property
     def sharpened(self) -> F64:
         """[view, 2] px², that the model takes off its projections; negative: that it adds to them."""
-        return np.where(self.excess > 0, _SHARE * np.minimum(self.excess, _MOST), self.excess)
+        return np.where(self.excess > 0, SHARPENED * np.minimum(self.excess, _MOST), self.excess)
 
     @property
     def smoothed(self) -> F64:
@@ -141,7 +141,8 @@ def as_voxels_see(views: F32, resolution: Resolution, counts: NDArray[np.bool_] 
 
     A ray that does not count, or has few beside it that do, keeps its value.
     """
-    filters = [resolution.transfer(axis, np.fft.rfftfreq(n + 2 * _PAD)) for axis, n in enumerate(views.shape[1:])]
+    sizes = enumerate(views.shape[1:])
+    filters = [resolution.transfer(axis, np.asarray(np.fft.rfftfreq(n + 2 * _PAD), np.float64)) for axis, n in sizes]
     if counts is None or counts.all():
         return _filtered(views, filters)
     shares = _filtered(counts.astype(np.float32), filters)

@@ -8,7 +8,7 @@ from functools import cache, partial
 from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
-from recon.base.empirical import FIRST_THRESHOLD, TRIAL_STEPS, TRIAL_SWEEPS, TRIAL_THRESHOLD
+from recon.base.empirical import FIRST_THRESHOLD, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
@@ -17,6 +17,7 @@ from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
+    TRIAL_SWEEPS,
     TRIALS,
     HeldOutTrial,
     choose_weight,
@@ -25,7 +26,7 @@ from recon.voxels.held_out import (
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
+from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import patch_choice, patch_steps
 
