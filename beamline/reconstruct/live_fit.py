@@ -65,6 +65,8 @@ class ScanFollower:
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []
         self._begin = clock.now()
+        self._uncorrected = 0  # views in the file that the fit has not got yet
+        self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
         self._slices = LiveSlices(self.views, self.snapshots, clock)
@@ -80,6 +82,11 @@ class ScanFollower:
         return self._cursor.n_corrected + (self._cursor.newest is not None)
 
     @property
+    def waiting(self) -> int:
+        """Views in the file that no step of the fit has learnt yet."""
+        return self._uncorrected + (0 if self._fit is None else self._fit.n_unlearnt)
+
+    @property
     def has_volume(self) -> bool:
         """Whether there is a model, with enough views for a volume after a stop."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
@@ -93,6 +100,7 @@ class ScanFollower:
         self._cursor = replace(self._cursor, frames=n, taken=self._cursor.taken if views.size else n)
         if views.size:
             self._step(views, ended)
+        self._uncorrected = int((views >= self._cursor.taken).sum())
         return grown
 
     def _step(self, views: NDArray[np.int64], ended: bool) -> None:
@@ -251,7 +259,7 @@ class ScanFollower:
         # A fit that begins anew counts from its own beginning; the history has one time, that of the snapshots.
         progress = replace(progress, seconds=self._clock.now() - self._begin)
         self._history.append(progress)
-        progress_events(self._sink, self._clock)(progress)
+        self._tell_progress(progress)
 
     def ask_whether_enough(self) -> None:
         """With a goal, report the gain by further views, and once that the views so far are enough."""

@@ -38,6 +38,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
+from recon.splatting.shown import Predictions, ShownVolume, direct_volume
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
@@ -98,12 +99,19 @@ class StreamingFit:
         self._round_views, self._schedule_step, self._placed = 0, 0, 0
         self.unlearnt = math.nan
         """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
+        self.predictions = Predictions()
+        """Of new views by the model and by FBP of the views before."""
         self.step_seconds = 0.0
         """Of a step, by the last `advance`."""
 
     @property
     def n_views(self) -> int:
         return len(self._angles)
+
+    @property
+    def n_unlearnt(self) -> int:
+        """Views that no step has taken yet."""
+        return len(self._unseen)
 
     @property
     def settings(self) -> FitSettings:
@@ -135,6 +143,11 @@ class StreamingFit:
             left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
             kept = self.unlearnt if math.isfinite(self.unlearnt) else left
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
+            assert self._problem is not None
+            images, scale = self._problem.images, self._problem.scale
+            self.predictions = self.predictions.met(
+                images, self._problem.geometry, rendered / scale, self.n_views - theta.size, self._now
+            )
 
     def newest_view(self) -> tuple[F32, F32]:
         """The newest view and the model's render of it, line integrals [row, col].
@@ -215,13 +228,14 @@ class StreamingFit:
             self._begin_round()
         if self._state is None or self._problem is None:
             return self.progress()
-        first = self._state.step
+        steps = 0
         while True:
             view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
             fit.step(self._state, self._problem, self._settings, self._fraction(), view)
             average(self._state, self._schedule_step)
+            steps += 1
             if (spent := self._now() - begin) >= seconds:
-                self.step_seconds = spent / (self._state.step - first)
+                self.step_seconds = spent / steps
                 return self.progress()
 
     @property
@@ -270,6 +284,14 @@ class StreamingFit:
         if self._state is None:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
         return fit.volume_of(averaged(self._state), self._grid, self._settings)
+
+    def shown(self) -> ShownVolume:
+        """The volume that predicts new views best: that of the model, or FBP of the views so far."""
+        direct = self.predictions.direct_is_better and self._problem is not None
+        if not direct or self._problem is None:
+            return ShownVolume(self.snapshot(), False, self.predictions)
+        data = direct_volume(self._problem.images, self._problem.geometry, self._grid) * self._problem.scale
+        return ShownVolume(Volume(data, self._grid), True, self.predictions)
 
     @property
     def gaussians(self) -> Gaussians | None:
