@@ -273,7 +273,7 @@ class ShownVolume:
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
             "because": str(self._parameters.get("chosen_because", "")),
-            "unseen_deg": self._parameters.get("unseen_deg"),
+            "unseen_deg": np.asarray(self._parameters.get("unseen_deg", ()), np.float64).tolist(),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,
             "coarse_bin": self._slices[0].bin,

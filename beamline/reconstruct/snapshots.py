@@ -69,8 +69,13 @@ class Snapshots:
             title=f"Snapshot from {fit.n_views} views",
             sample=self._sample,
             time=self._clock.now(),
-            parameters={"axis_col": axis_col, "n_views": fit.n_views, "method": method, "chosen_because": _why(errors)}
-            | ({} if self._unseen is None else {"unseen_deg": [math.degrees(angle) for angle in self._unseen]}),
+            parameters={
+                "axis_col": axis_col,
+                "n_views": fit.n_views,
+                "method": method,
+                "chosen_because": _why(errors),
+                "unseen_deg": np.degrees(self._unseen or ()),
+            },
         )
         try:
             write_reconstruction(self.path, record, replace=True)

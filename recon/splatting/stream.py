@@ -144,9 +144,9 @@ class StreamingFit:
             kept = self.unlearnt if math.isfinite(self.unlearnt) else left
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
             assert self._problem is not None
-            images, scale = self._problem.images, self._problem.scale
+            problem, before = self._problem, self.n_views - theta.size
             self.predictions = self.predictions.met(
-                images, self._problem.geometry, rendered / scale, self.n_views - theta.size, self._now
+                problem.images, problem.geometry, rendered / problem.scale, before, self._now
             )
 
     def newest_view(self) -> tuple[F32, F32]:

@@ -131,7 +131,7 @@ $("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
 // --- volume ------------------------------------------------------------------------------------------------------
 const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
 const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
-  draw: (context, place) => { if (axis === 0 && volume && volume.unseen_deg) dial(context, volume.unseen_deg); },
+  draw: (context, place) => { if (axis === 0 && volume && volume.unseen_deg.length) dial(context, volume.unseen_deg); },
   point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
 }));
 
