@@ -27,7 +27,7 @@ from recon.voxels.projector import Projector
 
 _ROWS = 8  # that are compared
 _VIEWS = 400  # of an FBP, at most; of more, some are left out evenly by angle
-_NEW = 0.2  # weight of the newest view in the running means
+_NEW = 0.4  # weight of the newest view in the running means
 _SHARE = 0.1  # of the time, at most, for the comparisons
 
 
@@ -54,11 +54,13 @@ class Predictions:
 
     Attributes:
         fit, direct: by the fit and by FBP.
+        n: comparisons.
         due: when the next comparison may be, by the clock.
     """
 
     fit: float = math.nan
     direct: float = math.nan
+    n: int = 0
     due: float = -math.inf
 
     @property
@@ -83,12 +85,13 @@ class Predictions:
         volume = direct_volume([np.asarray(image[rows]) for image in images[:before]], slab.select(range(before)), grid)
         seen = Projector(slab.select([geometry.n_views - 1]), grid).forward(volume)[0]
         errors = (volume_error(image, newest[rows]) for image in (rendered[rows], seen))
+        share = max(_NEW, 1 / (self.n + 1))
         fit, direct = (
-            new if math.isnan(old) else (1 - _NEW) * old + _NEW * new
+            new if self.n == 0 else (1 - share) * old + share * new
             for old, new in zip((self.fit, self.direct), errors, strict=True)
         )
         end = now()
-        return replace(self, fit=fit, direct=direct, due=end + (end - begin) * (1 / _SHARE - 1))
+        return replace(self, fit=fit, direct=direct, n=self.n + 1, due=end + (end - begin) * (1 / _SHARE - 1))
 
 
 @dataclass(frozen=True, eq=False)
