@@ -295,8 +295,8 @@ class SnapshotWritten(Event, event="snapshot"):
 
     Attributes:
         unlearnt: relative residual of new views before the fit has learnt them.
-        method: whose volume it is, the one that predicts new views better.
-        errors: of the views that came, by each method before it saw them, in the measure of the volume.
+        method: whose volume it is, the one that predicts views held out better.
+        errors: of each method in these views, in the measure of the volume.
     """
 
     path: Path

@@ -42,6 +42,7 @@ from recon.splatting.stream import StreamingFit
 
 BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
+_BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
 _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
@@ -66,6 +67,7 @@ class ScanFollower:
         self._history: list[Progress] = []
         self._begin = clock.now()
         self._uncorrected = 0  # views in the file that the fit has not got yet
+        self._said_behind = False
         self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
@@ -260,6 +262,19 @@ class ScanFollower:
         progress = replace(progress, seconds=self._clock.now() - self._begin)
         self._history.append(progress)
         self._tell_progress(progress)
+        self._say_if_behind(progress)
+
+    def _say_if_behind(self, progress: Progress) -> None:
+        """Say once that the fit does not keep up with the views."""
+        if self._said_behind or progress.n_views <= BATCH_VIEWS or progress.step >= _BEHIND * progress.n_views:
+            return
+        self._said_behind = True
+        message = (
+            f"The fit does not keep up: {count(progress.step, 'step')} for {progress.n_views} views, "
+            f"{self.waiting} wait. FBP is shown where it predicts views better, and the last round takes the steps "
+            "that are missing"
+        )
+        self._sink(StateEntered("behind", message, time=self._clock.now()))
 
     def ask_whether_enough(self) -> None:
         """With a goal, report the gain by further views, and once that the views so far are enough."""

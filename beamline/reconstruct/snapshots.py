@@ -107,8 +107,8 @@ class Snapshots:
             self.path.unlink(missing_ok=True)
 
     def _method(self, shown: ShownVolume) -> tuple[str, dict[str, float]]:
-        """Whose volume is shown, and how well each predicted new views; nothing where they were not compared."""
-        fit, found = self._options.streaming.name, shown.predictions
+        """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
+        fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
         return Fbp.name if shown.direct else fit, errors
 
@@ -129,7 +129,7 @@ def _why(errors: Mapping[str, float]) -> str:
     if not errors:
         return "the only one so far"
     each = ", ".join(f"{name} {error:.3f}" for name, error in errors.items())
-    return f"which predicts new views better (error of the volume along them: {each})"
+    return f"which predicts views held out better (error of the volume along them: {each})"
 
 
 _DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text

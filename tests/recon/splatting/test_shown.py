@@ -1,6 +1,8 @@
-"""Which volume of a growing scan is shown: the one that predicts new views better, in the measure of the volume."""
+"""Which volume of a growing scan is shown: the one that predicts views held out better, in the volume's measure."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +10,10 @@ import pytest
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
 from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.splatting import optimise
 from recon.splatting.last_round import LastRound
 from recon.splatting.r2 import R2
-from recon.splatting.shown import Predictions, direct_volume, volume_error
+from recon.splatting.shown import HeldOutErrors, direct_volume, volume_error
 from recon.splatting.stream import StreamingFit
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
@@ -82,17 +85,26 @@ def test_the_better_of_the_fit_and_fbp_is_shown(data: np.ndarray, steps: float, 
 def test_views_that_fbp_does_not_take_are_not_compared() -> None:
     cone = Geometry.cone([0.0, 1.0, 2.0], SHAPE, pixel_pitch=PITCH, sod=50.0, sdd=100.0)
     view = np.ones(SHAPE, np.float32)
-    assert not Predictions().met([view] * 3, cone, view, 2, SteppedClock(tick=1.0)).direct_is_better
+    for geometry, held_out in ((cone, [1]), (VIEWS.select(range(3)), [])):
+        errors = HeldOutErrors.of([view] * 3, geometry, held_out, lambda number: view)
+        assert np.isnan(errors.fit) and np.isnan(errors.direct)
 
 
-def test_comparing_takes_a_tenth_of_the_time() -> None:
-    clock, view = SteppedClock(tick=1.0), np.ones(SHAPE, np.float32)
-    views = VIEWS.select(range(10))
-    first = Predictions().met([view] * 10, views, view, 9, clock)
-    assert first.due == clock.time + 9
-    assert first.met([view] * 10, views, 2 * view, 9, clock) is first
-    clock.time += 10
-    assert first.met([view] * 10, views, 2 * view, 9, clock).fit > first.fit
+def test_views_held_out_are_learnt_by_the_last_round_alone(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = _grown(data, 3)
+    drawn, step = list[int | None](), optimise.step
+
+    def spy(state: Any, problem: Any, settings: Any, fraction: float, view: int | None = None) -> Any:
+        before = list(state.drawn)
+        step(state, problem, settings, fraction, view)
+        drawn.extend(before[len(state.drawn) :] if len(before) > len(state.drawn) else state.drawn)
+        drawn.append(view)
+
+    monkeypatch.setattr(optimise, "step", spy)
+    fit.advance(60)
+    assert {8, 24, 40}.isdisjoint(drawn) and {7, 9, 47} <= set(drawn)
+    fit.finish()
+    assert {8, 24, 40} <= set(drawn)
 
 
 def test_the_end_is_the_same_however_long_the_fit_had_to_wait(data: np.ndarray) -> None:

@@ -190,7 +190,7 @@ async function fetchModel() {
 }
 
 // --- curves ------------------------------------------------------------------------------------------------------
-const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"], error: ["views", "error along new views"] };
+const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"], error: ["views", "error along views held out"] };
 
 async function fetchTrace() {
   if (!region) return;
