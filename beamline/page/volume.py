@@ -233,7 +233,8 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, voxel along z, y, x and its unit, unit of values, method, views, windows of all times."""
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, views, angles of
+        the views that a sector lacks, windows of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
@@ -244,6 +245,8 @@ class ShownVolume:
             "length_unit": unit,
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
+            "because": str(self._parameters.get("chosen_because", "")),
+            "unseen_deg": np.asarray(self._parameters.get("unseen_deg", ()), np.float64).tolist(),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,
             "coarse_bin": self._slices[0].bin,

@@ -29,7 +29,7 @@ from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import duration_text, work_out
-from beamline.scan.live_plan import live_need
+from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
@@ -166,7 +166,8 @@ def _worked(
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or method == AUTO or not streams(method):
         return worked
-    return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, plan.n_views, free_memory())))
+    need = live_need(camera.shape, plan.n_views, free_memory())
+    return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
