@@ -24,6 +24,9 @@ from recon.voxels.iterative import prior_decisions
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 
+LEFT = "root mean square left of views held out, in line integrals"
+"""What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
+
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 

@@ -12,9 +12,9 @@ import click
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
-    WholeRange,
     POSITIVE,
     NameChoice,
+    WholeRange,
     declared,
     option,
     parsed,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
-from beamline.cli.options import WholeRange, POSITIVE, NameChoice, option, parsed, together
+from beamline.cli.options import POSITIVE, NameChoice, WholeRange, option, parsed, together
 from beamline.cli.scan_options import scan_options
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of

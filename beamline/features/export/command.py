@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.options import (
-    WholeRange,
     FiniteRange,
     NameChoice,
+    WholeRange,
     dataset_option,
     json_events,
     json_option,

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.options import (
-    WholeRange,
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
     FiniteRange,
     NameChoice,
+    WholeRange,
     json_events,
     json_option,
     volume_argument,

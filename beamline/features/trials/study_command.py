@@ -13,9 +13,9 @@ import click
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
-    WholeRange,
     MethodChoice,
     NameChoice,
+    WholeRange,
     dry_option,
     json_option,
     new_folder_option,

@@ -14,8 +14,8 @@ import click
 from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import (
-    WholeRange,
     POSITIVE,
+    WholeRange,
     dry_option,
     json_option,
     names_in,
