@@ -23,7 +23,9 @@ def config() -> None:
 def init(instrument: bool, file: str | None) -> None:
     """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
     if file is not None:
-        raise click.UsageError(f"config init prints the configuration and writes no file: beamline config init > {file}")
+        raise click.UsageError(
+            f"config init prints the configuration and writes no file: beamline config init > {file}"
+        )
     from beamline.config.load import config_folder
 
     name = "instrument.yaml" if instrument else "simulated.yaml"
@@ -62,10 +64,13 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool)
     Exit code: 0 valid, 2 wrong configuration or violated limit.
     """
     from beamline.config.load import load
-    from beamline.scan.preflight import dry_run, refuse_violations
+    from beamline.scan.preflight import doubts, dry_run, refuse_violations
 
     with json_events(as_json) as sink:
-        worked = dry_run(load(file, overrides, rehearse=rehearse))
+        loaded = load(file, overrides, rehearse=rehearse)
+        for sentence in doubts(loaded):
+            click.echo(f"Warning: {sentence}", err=True)
+        worked = dry_run(loaded)
         if not as_json:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
+from beamline.core.plausible import RANGES, doubt
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
@@ -159,7 +160,7 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
     """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
     usable = checked_views(source, selection, warn)
-    pixel_size(source, selection)
+    _warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
     for step in geometry_steps(selection):
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
@@ -167,6 +168,17 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
     return usable, poses
+
+
+def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
+    """Of a size, an energy or a distance that no instrument has, as of a mistaken unit."""
+    size_mm = pixel_size(source, selection)
+    stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
+    for step in in_order(selection):  # options of the same names
+        stated += [(each.name, getattr(step, each.name)) for each in fields(step) if each.name in RANGES]  # type: ignore[arg-type]
+    for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
+        if sentence:
+            warn(sentence)
 
 
 def _chosen(
