@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.plausible import RANGES, doubt
-from beamline.core.sinks import Warn
+from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
@@ -340,11 +340,12 @@ def report_defects(projections: Projections, warn: Warn) -> None:
     unseen = areas(projections.masked)
     masked = float((projections.masked & ~unseen).mean())
     if unseen.mean() > 1e-3:
-        warn(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured.")
+        warn(Note(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured."))
     if masked > 1e-3:
-        warn(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours.")
+        warn(Note(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours."))
     if projections.replaced > 1e-3:
-        warn(f"{projections.replaced:.1%} of the pixels were zingers or not finite: filled from their neighbours.")
+        replaced = f"{projections.replaced:.1%} of the pixels were zingers or not finite"
+        warn(Note(f"{replaced}: filled from their neighbours."))
     if projections.floored > 1e-3:
         warn(
             f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
