@@ -29,6 +29,7 @@ EXCHANGE_ENERGY_UNITS = {
     "joule": 1 / 1.602176634e-16,
     "": 1 / 1.602176634e-16,
 }
+EXCHANGE_TIME_UNITS = {**hdf5.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
 _HALF_PIXEL = 0.5  # what moves by less is not seen
 
 
@@ -260,8 +261,8 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
     Entry("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
     Entry("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
-    Entry("exchange/theta_white", "the order of flats among the views is not used", False),
-    Entry("exchange/theta_dark", "the order of darks among the views is not used", False),
+    Entry("exchange/theta_white", "where flats stand among the views, which then have the flats around them"),
+    Entry("exchange/theta_dark", "where darks stand among the views"),
     Entry("exchange/data_shift_x", _POSES, False, _shifts),
     Entry("exchange/data_shift_y", _POSES, False, _shifts),
     Entry("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
@@ -269,8 +270,16 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
     Entry("measurement/instrument/source/current", "one value for the whole scan", False),
     Entry(
-        "measurement/instrument/detector/exposure_time", "flats and darks are taken to be exposed as the views", False
+        "measurement/instrument/detector/exposure_time",
+        "exposure of darks, flats and views, or of each view; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
     ),
+    Entry(
+        "process/acquisition/flat_fields/flat_exposure_time",
+        "exposure of flats, where different_flat_exposure says that it is another; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
+    ),
+    Entry("process/acquisition/flat_fields/different_flat_exposure", "Different: flats have flat_exposure_time"),
     Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
     Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
     Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
