@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from beamline.storage.rules.references import ReferenceGroups
     from recon.prep.correct import References
 
+_STEADY = 0.01  # of the ring current: top-up keeps it so
+
 
 @dataclass(frozen=True)
 class ReferenceCheck:
@@ -218,6 +220,20 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
         lacking = "no ring current" if currents is None else "no ring current for some views or flats"
         raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
     return _to_median(currents, source.image_key)
+
+
+def uncorrected_current(source: ScanSource, selection: Selection) -> str:
+    """A warning where the ring current changed between flats and views and nobody asked to correct it; "" if not."""
+    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
+    if source.quantity != "counts" or use_current(selection) or (known := source.currents) is None:
+        return ""
+    currents = known[used]
+    if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
+        return ""
+    return (
+        f"The ring current of flats and views (control/data) varies from {currents.min():.6g} to {currents.max():.6g}, "
+        f"{currents.max() / currents.min() - 1:.0%}, and no air beside the sample corrects it: say --ring-current use."
+    )
 
 
 def _mean(

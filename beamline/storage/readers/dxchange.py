@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, Used, frame_indices
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.readers.stated import (
@@ -20,8 +20,10 @@ from beamline.storage.readers.stated import (
     EXCHANGE_ENERGY_UNITS,
     EXCHANGE_LENGTH_UNITS,
     EXCHANGE_TIME_UNITS,
+    in_use,
     not_copied,
     not_used,
+    unknown_fields,
 )
 from beamline.storage.readers.turned import TurnedFrames, dimensions
 from drivers.base.frame import FrameKind
@@ -63,6 +65,8 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
         source.stated = not_copied(file, TEXTS.values()) + not_used(EXCHANGE, file, source)
+        source.stated += unknown_fields(EXCHANGE, file, source)
+        source.in_use = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
             source.stated += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
@@ -73,9 +77,10 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 class ExchangeSource(StacksSource):
-    """A scan as Data Exchange; `stated` are the fields that are not used."""
+    """A scan as Data Exchange; `stated` are the fields that are not used, `in_use` those that are."""
 
     stated: tuple[NotUsed, ...] = ()
+    in_use: tuple[Used, ...] = ()
     _of_stack: NDArray[np.int64] | None = None
     """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
 
@@ -106,6 +111,10 @@ class ExchangeSource(StacksSource):
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
         return self.stated
+
+    @property
+    def used(self) -> tuple[Used, ...]:
+        return self.in_use
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> list[NDArray[np.float64] | None]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.references import ReferenceFrame
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.wrapped import in_words, of_energies
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
@@ -84,6 +85,20 @@ def _dark_levels(source: ScanSource, seen: LookAtRow) -> tuple[Darks, Darks]:
     return known[1:]
 
 
+def one_energy(source: ScanSource) -> Iterator[Finding]:
+    """The views were taken at one energy: a volume has one."""
+    if (energies := source.energies) is None:
+        return
+    of_views = energies[source.image_key == FrameKind.PROJECTION]
+    if len(parts := of_energies(of_views)) > 1:
+        yield Finding(
+            "error",
+            "energies",
+            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume is of one. Choose it, such "
+            f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
+        )
+
+
 def exposures_agree(source: ScanSource) -> Iterator[Finding]:
     """Darks are exposed as long as the projections, or darks of two exposures tell those of any other."""
     if source.quantity != "counts":
@@ -97,8 +112,8 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
             f"taken for {usual:g} s."
             if known
             else (
-                f"taken for {usual:g} s, and so are the flats, whose exposure is not stated: where the sample fills the "
-                "field, all line integrals may be off by the same amount."
+                f"taken for {usual:g} s, and so are the flats, whose exposure is not stated: where the sample fills "
+                "the field, all line integrals may be off by the same amount."
             )
         )
         yield Finding(

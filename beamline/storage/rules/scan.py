@@ -17,7 +17,7 @@ from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_jo
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
-from beamline.storage.rules.exposures import exposures_agree
+from beamline.storage.rules.exposures import exposures_agree, one_energy
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import views_scaled
 from drivers.base.frame import FrameKind
@@ -259,6 +259,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     quantity_stated,
     references_present,
     exposures_agree,
+    one_energy,
     pixels_measured,
     pixels_as_labelled,
     views_scaled,
