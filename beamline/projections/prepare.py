@@ -18,6 +18,7 @@ from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
+from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanStep
@@ -281,6 +282,8 @@ def assemble(
     report_defects(projections, warn)
     if sides := cut_sides(projections.data, geometry):
         warn(cut_sentence(sides))
+        if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
+            warn(change)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")

@@ -8,7 +8,9 @@ import math
 import os
 import re
 import stat
+import struct
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -197,8 +199,12 @@ def is_hdf5(path: Path, follow: bool = False) -> bool:
     return False
 
 
-ALTERED = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, OverflowError, MemoryError)
-"""What h5py and numpy raise where a file is damaged, or holds other things than its names promise."""
+ALTERED = (
+    *(OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
+    *(EOFError, MemoryError, struct.error, zlib.error),
+)
+"""What libraries raise where a file is damaged, or holds other things than its names promise; none of ours is among
+them."""
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -117,17 +118,17 @@ def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: boo
 def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
     """Place, configuration and overrides of each line of a table."""
     try:
-        lines = text_in(table, SETTINGS).splitlines()
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, strict=True)]
+        reader = csv.reader(io.StringIO(text_in(table, SETTINGS), newline=""), strict=True)
+        numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except (OSError, csv.Error) as error:
         raise ConfigError(f"{table} cannot be read as a table ({error}). Nothing was started.") from None
-    head = rows[0] if rows else []
-    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for row in rows[1:]):
+    head = numbered[0][1] if numbered else []
+    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
         raise ConfigError(
             f"{table} is no table of scans: expected a line of names, such as config,sample.name,scan.exposure_s, each "
             "once, and a line for each scan. Nothing was started."
         )
-    for number, row in enumerate(rows[1:], 2):
+    for number, row in numbered[1:]:
         if not any(row):
             continue
         cells = dict(zip(head, row, strict=False))

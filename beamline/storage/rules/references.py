@@ -25,6 +25,7 @@ from beamline.monitor.references import (
     judge,
 )
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.exposures import levelled
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
@@ -222,7 +223,11 @@ _seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDiction
 
 
 def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
-    """Statistics of a frame of any kind, with its cells; it is read once."""
+    """Statistics of a frame of any kind, with its cells, as of one dark; it is read once."""
+    return levelled(source, _as_it_is(source, row), lambda other: _as_it_is(source, other))
+
+
+def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
     seen = _seen.setdefault(source, {})
     if row not in seen:
         seen[row] = look_at(read_known(source, [row])[0], row)

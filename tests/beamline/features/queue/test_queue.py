@@ -54,6 +54,14 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
         queue_needs(load_queue([tmp_path / "day.csv"], ["scan.period_s=0.001"]), tmp_path).refuse_impossible()
 
 
+def test_a_cell_is_the_text_that_stands_in_it(tmp_path: Path) -> None:
+    lines = "config,sample.name,sample.description", f"{SIMULATED},a,rinsed # 3 times", f'{SIMULATED},b,"x\ny, z"'
+    scans = load_queue([table(tmp_path, *lines)], ())
+    assert [scan.config.sample.description for scan in scans] == ["rinsed # 3 times", "x\ny, z"]
+    with pytest.raises(ConfigError, match=r"line 5: .*'cell #1'; expected text of letters"):
+        load_queue([table(tmp_path, *lines, f"{SIMULATED},cell #1,")], ())
+
+
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
