@@ -125,7 +125,7 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
     headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
     width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
-    figure = new_figure((width / _DPI, height / _DPI), _DPI, None)
+    figure = new_figure((width / _DPI, height / _DPI), _DPI, False)
     top = height
     for row, pixels in zip(rows, tall, strict=True):
         if row.heading:

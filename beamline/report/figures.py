@@ -224,21 +224,21 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
 
 def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> bytes:
     """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
-    colours = {"cmap": "RdBu_r", "vmin": -8, "vmax": 8}
-    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", colours)
+    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", "RdBu_r", 8.0)
 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
-    return _map(image, grid, unit, "Highest density where views show nothing", kind.label(unit), {"cmap": "magma"})
+    return _map(image, grid, unit, "Highest density where views show nothing", kind.label(unit), "magma")
 
 
 def _map(
-    image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, colours: Mapping[str, object]
+    image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, colours: str, reach: float | None = None
 ) -> bytes:
-    """An image [y, x] of a slice of the grid, with a bar of its colours."""
+    """An image [y, x] of a slice of the grid, with a bar of its colours, which end at ±`reach`, or its values."""
     figure, axes = one_panel(5.4, 6.4)
-    shown = axes.imshow(image, extent=slice_extent(grid), interpolation="nearest", **colours)
+    low = None if reach is None else -reach
+    shown = axes.imshow(image, colours, vmin=low, vmax=reach, extent=slice_extent(grid), interpolation="nearest")
     axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=title)
     figure.colorbar(shown, ax=axes, label=label, pad=0.02)
     return png(figure)
@@ -344,11 +344,11 @@ def dpi_for(voxels: int, inches: float) -> float:
     return float(np.clip(voxels / inches, DPI, _FINEST))
 
 
-def new_figure(size: tuple[float, float], dpi: float = DPI, layout: str | None = "constrained") -> Figure:
-    """A figure of this width and height, inches, with its panels side by side where `layout` says so."""
+def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = True) -> Figure:
+    """A figure of this width and height, inches; `constrained`: panels make room for their labels."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size, dpi=dpi, layout=layout)
+    return Figure(figsize=size, dpi=dpi, layout="constrained" if constrained else None)
 
 
 def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:

@@ -44,7 +44,7 @@ class SliceSheet:
         # One image: a panel for each slice takes ten times as long to draw.
         sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
-        figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), None)
+        figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         for i, label in enumerate(labels):

@@ -31,7 +31,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     low, high = grey_window(views, 0.5, 99.8)
     rows = -(-len(frames) // COLUMNS)
     tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
-    figure = new_figure((10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), layout=None)
+    figure = new_figure((10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), constrained=False)
     anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
     for place, ((number, planned), frame) in enumerate(zip(chosen, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)
