@@ -76,12 +76,17 @@ class Superblock:
 
 
 def superblock(path: Path) -> Superblock | None:
-    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes."""
+    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes.
+
+    Of one of which only the first half was written, as before: its flags come first.
+    """
     with path.open("rb") as file:
         head = file.read(SIZE)
     if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:
         return None
-    return Superblock(head, path.stat().st_size)
+    tries = [head, *(head[:_FLAGS] + bytes([flags]) + head[_FLAGS + 1 :] for flags in (0, _WRITTEN | _GROWS))]
+    found = [Superblock(each, path.stat().st_size) for each in tries]
+    return next((each for each in found if each.intact), found[0])
 
 
 def made_whole(at: int, read: memoryview) -> tuple[int, bytes] | None:
