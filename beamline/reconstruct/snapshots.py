@@ -21,7 +21,7 @@ from beamline.plan.angles import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, new_figure, png, round_length
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
@@ -151,13 +151,11 @@ class PictureRow:
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
     """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
-    from matplotlib.figure import Figure
-
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
     headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
     width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+    figure = new_figure((width / _DPI, height / _DPI), _DPI, False)
     top = height
     for row, pixels in zip(rows, tall, strict=True):
         if row.heading:

@@ -255,6 +255,6 @@ def test_windows_are_buttons_of_the_page(tmp_path: Path) -> None:
     volume = ShownVolume(tmp_path / "v.npy")
     facts = volume.facts()
     volume.close()
-    assert [*facts["windows"]][0] == "matter" and [*facts["windows"]][-1] == "all"
+    assert next(iter(facts["windows"])) == "matter" and [*facts["windows"]][-1] == "all"
     assert facts["window"] == facts["windows"]["matter"]
     assert all(low < high for low, high in facts["windows"].values())
