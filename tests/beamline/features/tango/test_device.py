@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.tango.device import ServerPlace, device_class, push_changes
-from beamline.features.tango.followed_run import FollowedRun
+from beamline.features.tango.device import FollowedRun, ServerPlace, device_class, push_changes
 from beamline.features.tango.values import ScanAttributes
 from beamline.scan.control import Verb
 from beamline.storage.volumes.base import bare_record
