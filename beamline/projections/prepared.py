@@ -51,6 +51,7 @@ class PreparedProjections:
         times: [view] s when each was exposed; None: no method asked for it.
         energies: of the views, where they are of several scans; None: they are of one.
         recorded: what the volume's file says of several scans, by name; empty of one.
+        laws: what the views leave of the laws that hold for all of them, in words, by name.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -76,6 +77,7 @@ class PreparedProjections:
     energies: Energies | None = None
     recorded: Mapping[str, Value] = field(default_factory=dict)
     stretch: float = 1.0
+    laws: Mapping[str, str] = field(default_factory=dict)
 
     def stretched(self, volume: Volume) -> Volume:
         """A volume of `geometry` at the heights of its slices."""

@@ -20,6 +20,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
+from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
@@ -308,7 +309,11 @@ class ScanFollower:
                 self.write_snapshot()
                 last = self._clock.now()
 
-        self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=last))
+        message = (
+            f"The last round of the fit: {self._fit.last_steps} steps over all {count(self._fit.n_views, 'view')}, "
+            f"then sweeps on voxels; {seconds:g} s at most. A stop takes the volume as it is by then"
+        )
+        self._sink(StateEntered("finishing", message, time=last))
         return LastRound(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)
 
     def _joined(self) -> Projections:
@@ -325,6 +330,7 @@ class ScanFollower:
         selection, projections = self._options.selection, self._joined()
         geometry, seen = self.views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
+        compare_with_flats(self.source, selection, projections, self._warn, refused=False)
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}
         for step in in_order(selection):

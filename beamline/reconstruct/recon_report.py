@@ -41,7 +41,7 @@ def compose(
     """The report on a reconstruction; `unexplained` is the structure in its residual, if known."""
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    }
+    } | {f"law: {name}": left for name, left in prepared.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(made.method)}",
         summary=_summary(made, prepared, truth, metrics, context),

@@ -3,148 +3,23 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.core.text import one_line
-from beamline.features.tango.values import ScanAttributes, TimedAttributes
-from beamline.page.recording import Recording
-from beamline.page.run_files import Reader, watched
-from beamline.page.tiles import MOST, TileRegion
-from beamline.scan.control import Asked, Verb, ask
-from beamline.scan.runs import newest
+from beamline.features.tango.served_run import SHOWN, Picture, ServedRun, device_state, quality
+from beamline.page.followed_run import PERIOD, StampedValues
+from beamline.page.tiles import MOST
+from beamline.scan.control import Verb
 from beamline.storage.hdf5 import NotReadyError
 
-Picture = NDArray[np.float32]
-_NO_RUN = "There is no run so far."
-
-
-class FollowedRun:
-    """The newest run of a folder, also one that begins later. Calls may come from any thread.
-
-    Args:
-        say: takes a line for each verb.
-        now: a clock, s since the Unix epoch.
-    """
-
-    def __init__(self, runs: Path, say: Callable[[str], None], now: Callable[[], float] = time.time) -> None:
-        self._runs, self._say, self._now = runs, say, now
-        self._lock = threading.Lock()
-        self._reader: Reader | None = None
-        self._lines = 0
-        self._asked: list[Asked] = []
-        self.timed = TimedAttributes(ScanAttributes(), now())
-        self.refused = ""  # why the scan did not do the last verb
-
-    def close(self) -> None:
-        with self._lock:
-            if self._reader is not None:
-                self._reader.close()
-                self._reader = None
-
-    def look(self) -> TimedAttributes:
-        """The values now."""
-        with self._lock:
-            self._look_at_verbs()
-            self.timed = self._read()
-            return self.timed
-
-    def last_view(self) -> Picture:
-        """[row, col] of the newest frame in the file: the share of the light that the sample lets through where there
-        are darks and flats, else counts. Binned to 1024 pixels a side.
-
-        Raises:
-            DataError, NotReadyError: there is no frame.
-        """
-        with self._lock:
-            return self._opened().do(_newest_frame)
-
-    def volume_slice(self) -> Picture:
-        """[y, x] of the middle slice of the run's newest volume, in its unit. Binned to 1024 pixels a side.
-
-        Raises:
-            DataError: there is no volume.
-        """
-        everything = TileRegion(0, 2**31, 0, 2**31)
-        with self._lock:
-            return self._opened().on_volumes(
-                lambda shown: np.asarray(shown[0].cut(0, shown[0].shape[0] // 2, everything).values, np.float32)
-            )
-
-    def ask(self, verb: Verb) -> None:
-        """Send a verb to the run. Returns at once; a refusal that comes later is in `refused`.
-
-        Raises:
-            BeamlineError: no scan runs there, or the request cannot be made.
-        """
-        with self._lock:
-            self._asked.append(ask(newest(self._runs), verb))
-            self.refused = ""
-
-    def _look_at_verbs(self) -> None:
-        for asked in list(self._asked):
-            try:
-                if asked.state() is None:
-                    continue
-            except (BeamlineError, OSError) as error:
-                self.refused = f"{asked.verb}: {user_message(error)}"
-                self._say(self.refused)
-            self._asked.remove(asked)
-
-    def _opened(self) -> Reader:
-        if self._reader is None:
-            raise DataError(_NO_RUN)
-        return self._reader
-
-    def _read(self) -> TimedAttributes:
-        try:
-            what = watched(newest(self._runs))
-        except (ConfigError, DataError):
-            return self.timed  # no run so far
-        timed = self.timed
-        if self._reader is None or self._reader.what != what:
-            if self._reader is not None:
-                self._reader.close()
-            self._reader, self._lines = Reader(what), 0
-            timed = TimedAttributes(ScanAttributes(), self._now())
-        seen, angle = None, math.nan
-        try:
-            seen = self._reader.state()
-            if seen["frames"]:
-                angle = self._reader.do(_newest_angle)
-        except (DataError, NotReadyError, OSError):
-            pass
-        lines = self._reader.events.lines
-        timed, self._lines = timed.after(lines[self._lines :]), len(lines)
-        if seen is None:
-            return TimedAttributes(timed.values, timed.began, timed.times, unread=True)
-        return timed.with_file(seen, angle, self._now())
-
-
-def _newest_angle(recording: Recording) -> float:
-    """Degrees."""
-    angles = recording.columns(max(recording.progress().frames - 1, 0))["angle"]
-    return math.nan if not angles or angles[-1] is None else float(angles[-1])
-
-
-def _newest_frame(recording: Recording) -> Picture:
-    frames = recording.progress().frames
-    if not frames:
-        raise DataError("There is no frame in the file yet.")
-    whole = TileRegion(0, *recording.shape[:1], 0, *recording.shape[1:])
-    return recording.picture(frames - 1, whole, corrected=True)[0]
-
-
-PERIOD = 0.5  # s between two looks at the run
 _CLASS = "SplatlineScan"
 _CHECKS = 64  # of the monitor, at most
 _TYPES: dict[str, dict[str, Any]] = {
@@ -184,7 +59,7 @@ class ServerPlace:
         return f"tango://{self.address}:{self.port}/{self.device}#dbase=no"
 
 
-def device_class(run: FollowedRun, control: bool) -> type[Any]:
+def device_class(run: ServedRun, control: bool) -> type[Any]:
     """The class of the device.
 
     Args:
@@ -203,25 +78,25 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
 
     def reader(name: str) -> Callable[[Any], tuple[Any, float, Any]]:
         def read(device: Any) -> tuple[Any, float, Any]:
-            timed = run.timed
-            value = getattr(timed.values, name)
+            stamped = run.followed.stamped
+            value = getattr(stamped.values, name)
             value = list(value) if isinstance(value, tuple) else value
-            return value, timed.time(name), getattr(AttrQuality, timed.quality(name))
+            return value, stamped.stamp(name).time, getattr(AttrQuality, quality(stamped, name))
 
         return read
 
     def init_device(device: Any) -> None:
         Device.init_device(device)
-        for name in ("State", "Status", *(each.metadata["name"] for each in fields(ScanAttributes))):
+        for name in ("State", "Status", *(each.metadata["name"] for each in SHOWN)):
             device.set_change_event(name, True, False)
 
     body: dict[str, Any] = {
         "__doc__": "The newest run of a folder.",
         "init_device": init_device,
-        "dev_state": lambda device: getattr(DevState, run.timed.values.device_state),
+        "dev_state": lambda device: getattr(DevState, device_state(run.followed.stamped.values)),
         "dev_status": lambda device: status_of(run),
     }
-    for each in fields(ScanAttributes):
+    for each in SHOWN:
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
         body[each.metadata["name"]] = attribute(fget=reader(each.name), **facts)
     for name, taken, about in (
@@ -240,20 +115,20 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     return type(_CLASS, (Device,), body)
 
 
-def _picture_reader(run: FollowedRun, taken: Callable[[], Picture]) -> Callable[[Any], tuple[Any, float, Any]]:
+def _picture_reader(run: ServedRun, taken: Callable[[], Picture]) -> Callable[[Any], tuple[Any, float, Any]]:
     """Reads a picture as an attribute; where there is no picture yet, its quality is invalid."""
     from tango import AttrQuality
 
     def read(device: Any) -> tuple[Any, float, Any]:
         try:
-            return taken(), run.timed.time("stored"), AttrQuality.ATTR_VALID
+            return taken(), run.followed.stamped.stamp("stored").time, AttrQuality.ATTR_VALID
         except (DataError, NotReadyError, OSError):
-            return np.zeros((1, 1), np.float32), run.timed.began, AttrQuality.ATTR_INVALID
+            return np.zeros((1, 1), np.float32), run.followed.stamped.began, AttrQuality.ATTR_INVALID
 
     return read
 
 
-def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
+def _sender(run: ServedRun, verb: Verb) -> Callable[[Any], None]:
     """The command of the device that sends a verb to the run."""
     from tango import Except
 
@@ -268,9 +143,9 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
     return send
 
 
-def status_of(run: FollowedRun) -> str:
+def status_of(run: ServedRun) -> str:
     """The state and the last message of the scan, and why it did not do the last verb."""
-    values = run.timed.values
+    values = run.followed.stamped.values
     return one_line("; ".join(filter(None, (values.state, values.message, run.refused))), 1000)
 
 
@@ -286,13 +161,13 @@ def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], No
         ConfigError: pytango is not installed.
         DataError: the address cannot be listened at, or the database does not answer.
     """
-    with closing(FollowedRun(runs, say)) as run:
+    with closing(ServedRun(runs, say)) as run:
         served = device_class(run, control)
         import tango
         from tango.server import run as run_server
 
         def look() -> bool:
-            before, now = run.timed, run.look()
+            before, now = run.followed.stamped, run.look()
             for device in tango.Util.instance().get_device_list_by_class(_CLASS):
                 with tango.AutoTangoMonitor(device):
                     push_changes(device, before, now)
@@ -317,19 +192,19 @@ def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], No
             raise DataError(f"{place} cannot be served: {one_line(why, 300)}. Nothing was started.") from error
 
 
-def push_changes(device: Any, before: Any, now: Any) -> None:
+def push_changes(device: Any, before: StampedValues, now: StampedValues) -> None:
     """Tell clients that wait for changes of each value that was set again."""
     from tango import AttrQuality, DevState
 
-    for each in fields(ScanAttributes):
+    for each in SHOWN:
         name = each.name
         value, known = getattr(now.values, name), getattr(before.values, name)
         same = value == known or (value != value and known != known)  # NaN is not equal to itself
-        if same and now.time(name) == before.time(name) and now.quality(name) == before.quality(name):
+        at, how = now.stamp(name).time, quality(now, name)
+        if same and (at, how) == (before.stamp(name).time, quality(before, name)):
             continue
-        quality = getattr(AttrQuality, now.quality(name))
         value = list(value) if isinstance(value, tuple) else value
-        device.push_change_event(each.metadata["name"], value, now.time(name), quality)
-    if now.values.device_state != before.values.device_state:
-        device.push_change_event("State", getattr(DevState, now.values.device_state), math.floor(time.time()),
+        device.push_change_event(each.metadata["name"], value, at, getattr(AttrQuality, how))
+    if (state := device_state(now.values)) != device_state(before.values):
+        device.push_change_event("State", getattr(DevState, state), math.floor(time.time()),
                                  AttrQuality.ATTR_VALID)  # fmt: skip
