@@ -12,7 +12,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import measure, uniform_residual
 from beamline.reconstruct.remarks import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
-from recon.base.method import Reconstruction
+from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.projector import project
@@ -79,7 +79,7 @@ def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> Non
 def test_a_volume_that_was_stopped_is_not_compared(rng: np.random.Generator) -> None:
     made, prepared = _made(rng, {7: 0.5}, "sirt")
     assert odd_views_warning(made, prepared, Selection())
-    assert odd_views_warning(replace(made, settings={"ended_early": True}), prepared, Selection()) == ""
+    assert odd_views_warning(replace(made, ending=Ending(early=True)), prepared, Selection()) == ""
 
 
 @pytest.mark.parametrize(("method", "specks"), [("sirt", {}), ("fbp", {7: 0.5})])
