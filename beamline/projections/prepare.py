@@ -98,7 +98,7 @@ def prepare_projections(
     """
     if (emission := source.emission) is not None:
         if buffer is not None:
-            raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
+            refuse_spilled(source)
         views = import_module(in_folders("beamline.features", "VIEWS")["emission"])
         emitted: PreparedProjections = views.prepare_emission(source, emission, selection, warn)
         return emitted
@@ -150,6 +150,12 @@ def _with_held_out(
             held_out_weights=held_out.weights,
         )
     return prepared
+
+
+def refuse_spilled(source: ScanSource) -> None:
+    """Raise DataError for a scan whose views cannot lie on disk."""
+    if source.emission is not None:
+        raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
 
 
 def require_usable(source: ScanSource, selection: Selection) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.monitor.aside import Aside
+from beamline.monitor.change import SPAN
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
@@ -28,6 +28,47 @@ from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
+
+
+@dataclass(frozen=True)
+class Aside:
+    """Views with light so far, and those that checks left out.
+
+    Attributes:
+        views: their number.
+        alone: views that were not compared with earlier ones.
+        without_flats, cones, wider: views of a scan without flats, of a cone beam, of a sample wider than the field.
+    """
+
+    views: int = 0
+    alone: int = 0
+    without_flats: int = 0
+    cones: int = 0
+    wider: int = 0
+
+    def with_frame(self, context: ScanContext) -> Aside:
+        """After the next frame; the checks knew `context` of it."""
+        if context.view is None or context.grid is None:
+            return self
+        return Aside(
+            self.views + 1,
+            self.alone + (context.change is None),
+            self.without_flats + (not context.grid.flats),
+            self.cones + context.cone,
+            self.wider + (context.truncated and context.grid.flats),
+        )
+
+    def in_words(self) -> tuple[str, ...]:
+        """Checks, views and reason, a text each. First views, which have no earlier ones, count only if all do."""
+        alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
+        reasons = (
+            ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
+            ("gain, motion, floater, ghost, dips of beam", alone, "no four views before them at even steps of angle"),
+            ("opposite", self.cones, "cone beam"),
+            ("mass", self.wider, "sample wider than the field"),
+        )
+        return tuple(f"{checks} in {n} of {self.views} views ({why})" for checks, n, why in reasons if n)
+
 
 BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
 SAMPLES = 4  # frames of a kind that tell where the detector saturates

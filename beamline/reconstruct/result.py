@@ -19,7 +19,6 @@ from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
-from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import partly_seen
@@ -30,10 +29,30 @@ from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, reco
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock
+from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Volume
 from recon.methods import BASELINE
 from recon.prep.align import AxisEstimate
+from recon.splatting.gaussians import Gaussians
+
+
+def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
+    """The arrays of a model for a file, by name: physical values, so that no other program needs our parameters."""
+    return {
+        "kernel": gaussians.kernel.value,
+        "density_unit": gaussians.density_unit,
+        **gaussians.physical(),
+        "view_angles": geometry.angles,
+        "view_shifts": geometry.shifts,
+        "view_roll": geometry.roll,
+        "view_tilt": geometry.tilt,
+        **({"view_centres": geometry.centres} if geometry.centres.any() else {}),
+        "detector_shape": np.array(geometry.detector_shape),
+        "pixel_pitch": geometry.pixel_pitch,
+        "axis": np.array([geometry.axis_col, geometry.axis_row]),
+        "source_distances": np.array([geometry.sod, geometry.sdd]),
+    }
 
 
 def write_result(

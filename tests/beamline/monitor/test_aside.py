@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from beamline.monitor import watch
-from beamline.monitor.aside import Aside
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
+from beamline.projections.replay import Aside
 from drivers.base.frame import Frame
 from tests.beamline.monitor.conftest import COLS, ROWS
 

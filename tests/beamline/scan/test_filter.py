@@ -107,7 +107,7 @@ def test_a_wrong_configuration_is_refused(words: tuple[str, ...], said: str) -> 
 
 def test_the_doctor_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("p4p")
-    monkeypatch.setattr("beamline.features.doctor.disk.MOST", 1 << 20)
+    monkeypatch.setattr("beamline.features.doctor.examine.MOST", 1 << 20)
     chosen = f"devices.filter={{kind: epics, pv: 'pva://{PREFIX}f', places: {{none: 0, Cu: 2}}, timeout_s: 0.5}}"
     settings = shipped("instrument", chosen, f"storage.folder={tmp_path}")
     served, clock = Variables({"f": 2.0}), TickingClock()

@@ -140,7 +140,7 @@ def test_a_beam_of_many_energies_has_no_monochromator() -> None:
 
 def test_the_doctor_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     pytest.importorskip("p4p")
-    monkeypatch.setattr("beamline.features.doctor.disk.MOST", 1 << 20)
+    monkeypatch.setattr("beamline.features.doctor.examine.MOST", 1 << 20)
     url = f"pva://{PREFIX}e"
     chosen = f"devices.monochromator={{kind: epics, pv: '{url}', status_pv: '{url}', timeout_s: 0.5, unit: eV, " + (
         "range_kev: [4, 25]}"

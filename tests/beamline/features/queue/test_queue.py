@@ -10,7 +10,7 @@ from beamline.config.load import config_folder
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import RunStarted, StateEntered
 from beamline.core.stop import ScanStopped, StopRequest
-from beamline.features.queue.queue import (
+from beamline.features.queue.scans import (
     QueuedScan,
     QueueError,
     QueueStatus,
