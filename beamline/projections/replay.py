@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
+from beamline.monitor.skipped_checks import SkippedChecks
 from beamline.monitor.watch import look_past_failures, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.interrupted import next_step
@@ -36,8 +36,8 @@ POLL = 0.1  # s between looks at a growing file
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What the checks said of a frame, and which frames there are so far.
+class FrameVerdict:
+    """What the checks found in a frame, and the state of the scan up to it.
 
     Attributes:
         row: of the frame, in the file.
@@ -53,7 +53,7 @@ class Judged:
     kind: FrameKind
     flags: tuple[Flag, ...]
     n: int
-    aside: Aside
+    aside: SkippedChecks
     drift: str = ""
     failures: tuple[str, ...] = ()
 
@@ -115,7 +115,7 @@ def replay(
     model: Callable[[float, int], NDArray[np.float32]] | None = None,
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Judged]:
+) -> Iterator[FrameVerdict]:
     """Look at every frame, in the order of the file.
 
     Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
@@ -129,12 +129,12 @@ def replay(
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
+    monitor, aside = start(replace(context_of(source), model=model), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
 
 
 def frames_of(
@@ -167,7 +167,7 @@ def frames_of(
         follow.sleep(POLL)
 
 
-def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> ScanVerdict:
+def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
     """What the checks said of the frames, together with what is wrong with darks, flats and the file.
 
     Args:

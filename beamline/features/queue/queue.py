@@ -43,8 +43,8 @@ class QueueStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class TakenScan:
-    """A scan, or a series of energies, that was taken: where it is, and the faults of its frames, a sentence each."""
+class RecordedScan:
+    """A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
 
     path: Path
     faults: tuple[str, ...] = ()
@@ -190,7 +190,7 @@ class QueueNeeds:
                 f"{size(self.free_bytes)} free; free some, or choose another storage.folder"
             )
         if faults:
-            raise ConfigError("".join(["the queue cannot be taken, nothing was started:", *_indented(faults)]))
+            raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
 
 
 def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
@@ -210,7 +210,7 @@ def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
 
 def run_queue(
     queue: Sequence[QueuedScan],
-    take: Callable[[int, QueuedScan, StopRequest, RunNotes], TakenScan],
+    take: Callable[[int, QueuedScan, StopRequest, RunNotes], RecordedScan],
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:

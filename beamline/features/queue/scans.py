@@ -15,8 +15,8 @@ from beamline.core.events import Done, Sink
 from beamline.core.stop import StopRequest
 from beamline.features.queue.queue import (
     QueuedScan,
+    RecordedScan,
     RunNotes,
-    TakenScan,
     load_queue,
     queue_needs,
     raise_unless_complete,
@@ -52,7 +52,7 @@ def take_all(request: ScanRequest) -> None:
 
 def _take_next(
     request: ScanRequest, of: int, json_sink: Sink, n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes
-) -> TakenScan:
+) -> RecordedScan:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
         ask_operator(f"Scan {n + 1} of {of}: bring {waiting.name} to its place.")
@@ -60,9 +60,9 @@ def _take_next(
     sinks: list[Sink] = [json_sink, run]
     if waiting.config.scan.energies is not None:
         done = take_energies(waiting.config, request, sinks, stop)
-        return TakenScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
+        return RecordedScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
     with ExitStack() as held:
         result = run_one(waiting.config, None, request, sinks, held, stop)
     if request.rehearse:
         click.echo("\n".join(rehearsed_lines(waiting.config, result, request)), err=True)
-    return TakenScan(result.path, tuple(faults_of(result)))
+    return RecordedScan(result.path, tuple(faults_of(result)))

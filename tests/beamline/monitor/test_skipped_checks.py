@@ -7,15 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 from beamline.monitor import watch
-from beamline.monitor.aside import Aside
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
+from beamline.monitor.skipped_checks import SkippedChecks
 from drivers.base.frame import Frame
 from tests.beamline.monitor.conftest import COLS, ROWS
 
 
 def said(frames: Iterable[Frame], **known: Any) -> tuple[str, ...]:
-    monitor, aside = watch.start(ScanContext(65535, ROWS * COLS, **known), ()), Aside()
+    monitor, aside = watch.start(ScanContext(65535, ROWS * COLS, **known), ()), SkippedChecks()
     for frame in frames:
         monitor, _ = watch.look(monitor, frame, digest(frame.counts, 65535, 4))
         aside = aside.with_frame(monitor.context)

@@ -1,4 +1,4 @@
-"""Aside: which checks skipped views of a scan, and why. Otherwise a scan without findings would count as good."""
+"""Which checks skipped views of a scan, and why: a scan that nothing could check must not count as good."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from beamline.monitor.check import ScanContext
 
 
 @dataclass(frozen=True)
-class Aside:
-    """Views with light so far, and those that checks left out.
+class SkippedChecks:
+    """Counts of views with light so far, and of those that checks skipped.
 
     Attributes:
         views: their number.
@@ -24,11 +24,11 @@ class Aside:
     cones: int = 0
     wider: int = 0
 
-    def with_frame(self, context: ScanContext) -> Aside:
+    def with_frame(self, context: ScanContext) -> SkippedChecks:
         """After the next frame; the checks knew `context` of it."""
         if context.view is None or context.grid is None:
             return self
-        return Aside(
+        return SkippedChecks(
             self.views + 1,
             self.alone + (context.change is None),
             self.without_flats + (not context.grid.flats),
