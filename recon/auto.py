@@ -37,8 +37,8 @@ class Auto:
 
     The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
     and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
-    settings of their own, each is run on 32 rows, or on all of them at half the resolution. There is no trial with
-    fewer than 16 views: the last one takes these. docs/choosing.md has reasons.
+    settings of their own, each is run on 32 rows, or on all of them at half the resolution. Trials need at
+    least 16 views; with fewer the last candidate is used. docs/choosing.md has reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.

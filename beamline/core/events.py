@@ -270,7 +270,7 @@ class FrameFlagged(Event, event="flag"):
 
 
 class RuleBroken(Event, event="flag"):
-    """A rule of a format that a file does not keep."""
+    """A file violates a rule of its format."""
 
     severity: str
     rule: str

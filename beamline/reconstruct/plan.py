@@ -125,7 +125,7 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
             refuse_whole(source, options, needs, plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
-            f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
+            f"{source.path}: its views are rolled or tilted, and a volume in slabs needs slices aligned with rows. "
             "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
         )
 

@@ -182,7 +182,7 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
 
 
 def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
-    """The record without what its files hold, or, where none is written, with no more than its volumes."""
+    """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:
         at = None if target.names or series is None else 0

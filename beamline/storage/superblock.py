@@ -51,12 +51,12 @@ class Superblock:
 
     @property
     def intact(self) -> bool:
-        """Whether its checksum is right."""
+        """Whether the checksum of the head is right."""
         return self.head[_CHECKSUM] == lookup3(self.head[: _CHECKSUM.start])
 
     @property
     def end(self) -> int:
-        """Bytes that the file has, as its head says."""
+        """Length of the file in bytes, as its head states it."""
         return int.from_bytes(self.head[_END], "little")
 
     def closed(self, end: int) -> Superblock:

@@ -52,8 +52,8 @@ class QueueStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class TakenScan:
-    """A scan, or a series of energies, that was taken: where it is, and the faults of its frames, a sentence each."""
+class RecordedScan:
+    """A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
 
     path: Path
     faults: tuple[str, ...] = ()
@@ -199,7 +199,7 @@ class QueueNeeds:
                 f"{size(self.free_bytes)} free; free some, or choose another storage.folder"
             )
         if faults:
-            raise ConfigError("".join(["the queue cannot be taken, nothing was started:", *_indented(faults)]))
+            raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
 
 
 def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
@@ -219,7 +219,7 @@ def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
 
 def run_queue(
     queue: Sequence[QueuedScan],
-    take: Callable[[int, QueuedScan, StopRequest, RunNotes], TakenScan],
+    take: Callable[[int, QueuedScan, StopRequest, RunNotes], RecordedScan],
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
@@ -312,7 +312,7 @@ def take_all(request: ScanRequest) -> None:
 
 def _take_next(
     request: ScanRequest, of: int, json_sink: Sink, n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes
-) -> TakenScan:
+) -> RecordedScan:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
         ask_operator(f"Scan {n + 1} of {of}: bring {waiting.name} to its place.")
@@ -320,9 +320,9 @@ def _take_next(
     sinks: list[Sink] = [json_sink, run]
     if waiting.config.scan.energies is not None:
         done = take_energies(waiting.config, request, sinks, stop)
-        return TakenScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
+        return RecordedScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
     with ExitStack() as held:
         result = run_one(waiting.config, None, request, sinks, held, stop)
     if request.rehearse:
         click.echo("\n".join(rehearsed_lines(waiting.config, result, request)), err=True)
-    return TakenScan(result.path, tuple(faults_of(result)))
+    return RecordedScan(result.path, tuple(faults_of(result)))
