@@ -76,7 +76,7 @@ class Resolution:
     @property
     def sharpened(self) -> F64:
         """[view, 2] px², that the model takes off its projections; negative: that it adds to them."""
-        return np.where(self.excess > 0, SHARPENED * np.minimum(self.excess, _MOST), self.excess)
+        return np.minimum(np.where(self.excess > 0, SHARPENED * self.excess, self.excess), _MOST)
 
     @property
     def smoothed(self) -> F64:
