@@ -38,7 +38,7 @@ def views_of(truth: F32, each: int, sections: F64 = SECTIONS, noise: float = 0.0
     n, (rows, side) = len(sections) * each, (truth.shape[1], truth.shape[-1])
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(sections)
     dense = Geometry.parallel(angles, (rows, side), axis_col=(side - 1) / 2)
-    projector = Projector(dense, Grid.matching(dense))
+    projector = Projector(dense, Grid.matching(dense)).plain
     lines = sum(
         projector.forward(np.ascontiguousarray(volume)) * sections[energy, m][:, None, None]
         for m, volume in enumerate(truth)
