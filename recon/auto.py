@@ -58,7 +58,7 @@ class Auto:
             raise ValueError("candidates must be at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
+        """The result of the chosen method, with the reason.
 
         Raises:
             ValueError: no candidate takes these views or data.
@@ -71,7 +71,7 @@ class Auto:
         device = problem.device if chosen.traits.device else "cpu"
         result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": because}
-        return replace(result, settings=settings, method=chosen.name)
+        return replace(result, settings=settings, method=chosen.name, chosen=because)
 
     def choose(self, problem: ReconProblem, control: RunControl, decide: Decisions) -> tuple[int, str, bool]:
         """Number of the chosen method, the reason, and whether there were trials.
@@ -133,8 +133,12 @@ class Auto:
 
 def _judged_beside(method: Method) -> bool:
     """The trial of a fit judges this method, too."""
-    given = getattr(method, "tv_weight", None), getattr(method, "patch_threshold", None)
-    return isinstance(method, Fbp | FistaTv | PnpDct) and given == (None, None)
+    match method:
+        case FistaTv():
+            return method.tv_weight is None
+        case PnpDct():
+            return method.patch_threshold is None
+    return isinstance(method, Fbp)
 
 
 def _residual(method: Method, tried: Candidates) -> float:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, ReconProblem, RunControl
+from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
@@ -75,7 +75,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         if use.emission is None:
             warn_of_other_quantity(data)
-    if not getattr(chosen, "allow_negative", True):
+    if isinstance(chosen, SignedMethod) and not chosen.allow_negative:
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     begin = control.now()

@@ -81,11 +81,21 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
         run_reconstruction(options, values)
 
 
-def _checked_method(context: click.Context, method: str | None, slabs: Path | None) -> str:
+def options_of(context: click.Context, default: str = "") -> ReconOptions:
+    """The options of the reconstruction that a context of `recon` asks for; see `_checked_method`."""
+    values = dict(context.params)
+    file, method, output = (values.pop(name) for name in ("file", "method", "output"))
+    slabs = values["resume"] if resumes_slabs(values["resume"]) else None
+    method = _checked_method(context, method, slabs, default)
+    return _options(context, file, method, output or Path(f"{file.stem}_{method}.h5"), values)
+
+
+def _checked_method(context: click.Context, method: str | None, slabs: Path | None, default: str = "") -> str:
     """The method's name, after all options were found to go together and with it.
 
     Args:
         slabs: partial volume that --resume names.
+        default: the method where none is named; empty: the usual one for such options.
 
     Raises:
         UsageError: they do not.
@@ -99,7 +109,7 @@ def _checked_method(context: click.Context, method: str | None, slabs: Path | No
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
-        method = _in_time() if "time" in asked else DEFAULT if of_fits else AUTO
+        method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {slabs}"})
     if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
@@ -200,7 +210,7 @@ def run_reconstruction(
     output = " and ".join(map(str, options.target.outputs))
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
-    if lost := record.parameters.get("checkpoint_lost"):
+    if lost := record.ending.lost_checkpoint:
         raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
     if record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")

@@ -28,7 +28,7 @@ from beamline.config.models import (
 from beamline.config.rehearsal import rehearsal
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
-from beamline.core.files import SETTINGS, text_in
+from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.shipped import config_folder as config_folder
 from beamline.core.shipped import version
 from beamline.plan import angles
@@ -61,6 +61,11 @@ def load(
     except FileNotFoundError:
         raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
     except OSError as error:
+        if (kind := kind_of_data(path)) is not None:
+            raise ConfigError(
+                f"{path} is {kind}, not a configuration: `beamline info {path}` says what it holds. Nothing was "
+                "started."
+            ) from None
         raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
     tree = read(text, str(path))
     _locate(tree.data, path.parent)

@@ -58,9 +58,11 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
         _walk(node, (), name, origins)
         return loader.construct_document(node), origins
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
+        colon = error.problem is not None and "expected ':'" in error.problem  # which is missed at the next line
+        mark = (error.context_mark if colon else None) or error.problem_mark or error.context_mark
         where = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
         what = ", ".join(part for part in (error.context, error.problem) if part)
+        what = "a colon is missing after a key" if colon else what
         raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
     except (yaml.YAMLError, *YAML_FAULTS) as error:
         what = " ".join(str(error).split()) or type(error).__name__

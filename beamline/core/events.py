@@ -440,14 +440,6 @@ class TrialDone(Event, event="trial"):
     figures: Mapping[str, Any] = _spread()
 
 
-class BenchStarted(Listed, event="bench_started"):
-    """Measurements of speed begin; the values are the machine and what is measured."""
-
-
-class BenchDone(Listed, event="bench"):
-    """One row of the table of a bench."""
-
-
 class CostExplained(Listed, event="explain"):
     """What a frame of a scene costs, by effect."""
 

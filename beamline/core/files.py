@@ -76,6 +76,18 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
         raise OSError(errno.EFBIG, f"It has {status.st_size} bytes, and at most {largest:.0f} are read", str(path))
 
 
+_DATA = {b"\x89HDF": "an HDF5 file", b"II*\0": "a TIFF file", b"MM\0*": "a TIFF file", b"PK\3\4": "a .zip or .npz file"}
+
+
+def kind_of_data(path: Path) -> str | None:
+    """What kind of data a file holds by its first bytes, for a sentence; None for another one."""
+    try:
+        with path.open("rb") as file:
+            return _DATA.get(file.read(4))
+    except OSError:
+        return None
+
+
 def leads_away(path: Path) -> bool:
     """Whether a path is a link, or a junction of Windows, to another place."""
     try:

@@ -221,6 +221,8 @@ def full_scale(largest: float) -> float:
 
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
+    if all(_of_one_number(frame) for frame in (*flats, *(darks or ()))):
+        return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score = float(np.median([flat.saturated for flat in flats])) - hot
     if score <= limits.saturated:
@@ -230,6 +232,10 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
         "Shorten the exposure or add a filter."
     )
     return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
+
+
+def _of_one_number(frame: ReferenceFrame) -> bool:
+    return bool(np.ptp(frame.blocks) == 0)
 
 
 def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:

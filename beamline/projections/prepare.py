@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.consistency import warn_of_inconsistency
+from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
@@ -121,6 +121,7 @@ def prepare_projections(
         check(view_geometry.of(used))
     phases.enter("correction")
     projections = _corrected(source, correction, used, buffer, phases)
+    light = compare_with_flats(source, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     geometry, place = view_geometry.of(projections.view_ids), (view_geometry.axis_col, axis)
     prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
@@ -128,7 +129,7 @@ def prepare_projections(
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
-    warn_of_inconsistency(prepared, selection, warn)
+    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
 
 

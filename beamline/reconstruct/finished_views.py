@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
@@ -16,15 +15,14 @@ from beamline.reconstruct.in_time import fit_within
 from beamline.reconstruct.job import Channels, Job, compile_kernels
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import facts_of
+from beamline.reconstruct.plan import ReconPlan
 from beamline.reconstruct.progress import corrections_done
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.remarks import partly_seen_warning
 from beamline.reconstruct.slab_run import keeping
 from beamline.reconstruct.slabs import prepare_within
-from recon.base.method import BoundedMethod, volumes_of
-from recon.base.slabs import Slab
+from recon.base.method import BoundedMethod
 from recon.base.stop import Stop
-from recon.base.volume import Grid
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
@@ -43,15 +41,15 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         box = options.region if isinstance(options.region, Region) else None
         if box is not None and box.reason:
             sink(StateEntered("roi", box.reason, time=clock.now()))
-        prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
-    prepared = _for_method(options, prepared, slabs, channels)
+        prepared, plan = prepare_within(source, options, sink, clock, warn, phases)
+    prepared = _for_method(options, prepared, plan, channels)
     _announce(options, prepared, channels)
     if few := partly_seen_warning(prepared.geometry):
         warn(few)
     region = None if box is None else locate(box, options.selection, prepared.geometry)
     # A direct method and a slab have no volume so far: a signal interrupts them.
-    stopping = never_stopped if options.method.traits.direct or slabs else channels.stop_scope
-    with keeping(options.partial_path) if slabs else nullcontext():
+    stopping = never_stopped if options.method.traits.direct or plan.slabs else channels.stop_scope
+    with keeping(options.partial_path) if plan.slabs else nullcontext():
         phases.enter("compiling kernels")
         compile_kernels(options, prepared.geometry, sink, clock)
         phases.enter("reconstruction")
@@ -66,14 +64,14 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
             prepared,
             lambda: facts,
             stopping,
-            slabs=slabs,
+            slabs=plan.slabs,
             region=region,
             leaves=before_report.leaves,
         )
 
 
 def _for_method(
-    options: ReconOptions, prepared: PreparedProjections, slabs: Sequence[Slab], channels: Channels
+    options: ReconOptions, prepared: PreparedProjections, plan: ReconPlan, channels: Channels
 ) -> PreparedProjections:
     """The views as the method takes them, with some held out where it ends early, after their disk was looked at.
 
@@ -82,7 +80,7 @@ def _for_method(
     """
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
-    if options.cluster is not None and not slabs:
+    if options.cluster is not None and not plan.slabs:
         channels.warn(
             "The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs."
         )
@@ -91,9 +89,7 @@ def _for_method(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
-    volume = 4 * volumes_of(options.method) * math.prod(Grid.matching(prepared.geometry).shape)
-    volumes = volume * options.target.written * (1 + options.uncertainty)
-    options.target.require_room(*(options.disk_needs(volume) if slabs else (volumes, 0)))
+    options.target.require_room(plan.output, plan.scratch)
     return prepared
 
 

@@ -22,7 +22,7 @@ from drivers.base.clock import Clock
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
-DEFAULT_SECONDS = 20.0  # of the last round
+MOST_SECONDS = 600.0  # of the last round
 
 
 @contextmanager
@@ -60,7 +60,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
         phases = Phases(sink, clock)  # waiting for views does not count as work
         phases.enter("last round")
-        last_round = follower.last_round(options.streaming.seconds or DEFAULT_SECONDS, timing.snapshot)
+        last_round = follower.last_round(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
         yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), last_round=last_round)
     follower.snapshots.remove()

@@ -102,7 +102,7 @@ class VolumeLooks:
     @property
     def waited_for(self) -> bool:
         """Somebody stopped the reconstruction, and waits."""
-        return "ended_early" in self.made.settings
+        return self.made.ending.early
 
     @property
     def direct(self) -> bool:

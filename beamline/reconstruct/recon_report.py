@@ -41,7 +41,7 @@ def compose(
     """The report on a reconstruction; `unexplained` is the structure in its residual, if known."""
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    }
+    } | {f"law: {name}": left for name, left in prepared.laws.items()}
     return Report(
         title=f"{context.facts.sample or context.facts.name}: {label_of(made.method)}",
         summary=_summary(made, prepared, truth, metrics, context),
@@ -130,7 +130,7 @@ def _footnotes(
             "Time of reconstruction of R²-Gaussian: from the first look at the growing file to the volume; it includes "
             "the scan."
         )
-    if "resumed_from" in made.settings:
+    if made.ending.resumed_from:
         footnotes.append(
             f"Time of reconstruction of {label_of(made.method)}: since the fit was resumed, without the time before."
         )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.projections.selection import check_axis
 from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.options import ReconOptions
@@ -47,6 +48,8 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
         for each in scans_of(options.source):
             with each.open() as source:
                 _require_finished(source, options)
+                if options.selection.axis_col is not None:
+                    check_axis(source, options.selection.axis_col)
     return truth
 
 

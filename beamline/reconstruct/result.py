@@ -26,7 +26,7 @@ from beamline.reconstruct.remarks import partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
-from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile
+from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock
@@ -232,6 +232,7 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "filter": context.filter,
         "seed": context.seed,
         **_flat("", made.settings),
+        **recorded_ending(made.ending),
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
         **({"recipe": context.recipe} if context.recipe else {}),

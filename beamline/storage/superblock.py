@@ -13,7 +13,7 @@ from pathlib import Path
 SIZE = 48
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
-_GROWS = 4
+_WRITTEN, _GROWS = 1, 4
 _WORD = 0xFFFFFFFF
 
 
@@ -51,8 +51,15 @@ class Superblock:
 
     def closed(self, end: int) -> Superblock:
         """The head of the same file as if it had been closed with so many bytes."""
+        return self._with(0, end)
+
+    def marked(self) -> Superblock:
+        """The head of the same file as if its writer had died: others may read it."""
+        return self._with(_WRITTEN | _GROWS, self.end)
+
+    def _with(self, flags: int, end: int) -> Superblock:
         head = bytearray(self.head)
-        head[_FLAGS] = 0
+        head[_FLAGS] = flags
         head[_END] = end.to_bytes(8, "little")
         head[_CHECKSUM] = lookup3(bytes(head[: _CHECKSUM.start]))
         return replace(self, head=bytes(head))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar, Self
@@ -26,7 +27,7 @@ class LastRound:
     Attributes:
         fit: holds the line integrals of the problem that it is run on, in the same order.
         method: that began the fit.
-        seconds: for the round and the sweeps.
+        seconds: for the round and the sweeps, at most.
         began: when the fit began to wait for views, by the clock of the run; `Progress.seconds` count from there.
         before: the progress of the fit until now.
         on_progress: is told of each progress of the round, too, while the fit can be looked at.
@@ -49,11 +50,9 @@ class LastRound:
         Raises:
             ValueError: no view has arrived, or the views hold no matter.
         """
-        begin, stop, sweeps = control.now(), control.stop, self.method.finish_sweeps
-        plan = FinishPlan(0, 0.0)
-        if sweeps:
-            plan = finish_within(FINISH_SHARE * self.seconds, 0.0, problem.geometry, problem.grid, control.now)
-        history = list(self.before)
+        begin, stop = control.now(), control.stop
+        end, history = begin + self.seconds, list(self.before)
+        plan = self._finish_plan(problem, control)
 
         def tell(progress: Progress) -> None:
             progress = replace(progress, seconds=control.now() - self.began)
@@ -66,20 +65,35 @@ class LastRound:
             self.on_progress(progress)
             return stop()
 
-        tell(self.fit.finish(max(begin + self.seconds - plan.seconds - control.now(), 0.0), on_progress))
-        volume, gaussians = self.fit.snapshot(), self.fit.gaussians
-        sweeps = sweeps if plan.sweeps is None else min(sweeps, plan.sweeps)
-        if sweeps and gaussians is not None and not stop():
-            late = replace(control.by(begin + self.seconds), stop_trials=None if plan.trials else lambda: True)
-            volume, sweeps = finish(volume, gaussians, problem, sweeps, self.fit.settings, late)
+        tell(self.fit.finish(max(end - plan.seconds - control.now(), 0.0), on_progress))
+        volume, gaussians, reached, sweeps = self.fit.snapshot(), self.fit.gaussians, history[-1], 0
+        if plan.sweeps != 0 and gaussians is not None and not stop():
+            late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
+            volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)
+        whole = plan.sweeps == self.method.finish and reached.step >= reached.steps and control.now() < end
+        if not (whole or stop.stopped):
+            warnings.warn(
+                f"{self.seconds:g} s did not suffice for the last round: {reached.step} of {reached.steps} steps, and "
+                f"{'a whole' if plan.sweeps is None else 'a shorter' if sweeps else 'no'} finish on voxels. "
+                "A reconstruction of the finished scan leaves nothing out",
+                stacklevel=2,
+            )
         settings = {
             **asdict(self.fit.settings),
             "finish": sweeps,
-            "seconds_after_scan": self.seconds,
-            "gaussians": history[-1].n_gaussians,
+            "seconds_after_scan": control.now() - begin,
+            "gaussians": reached.n_gaussians,
         }
-        seconds = control.now() - begin  # since the last view: before it the fit waited for views
+        seconds = control.now() - self.began
         return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)
+
+    def _finish_plan(self, problem: ReconProblem, control: RunControl) -> FinishPlan:
+        """The finish that a fit of the whole scan has; less of it where the seconds are too few."""
+        if not self.method.finish_sweeps:
+            return FinishPlan(0, 0.0)
+        beside = self.seconds - self.fit.last_steps * self.fit.step_seconds
+        plan = finish_within(FINISH_SHARE * self.seconds, beside, problem.geometry, problem.grid, control.now)
+        return plan if self.method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=self.method.finish)
 
     def toy(self) -> Self:
         """The same: its kernels were compiled when the fit began."""

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
+from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
@@ -97,6 +98,8 @@ class StreamingFit:
         self._round_views, self._schedule_step, self._placed = 0, 0, 0
         self.unlearnt = math.nan
         """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
+        self.step_seconds = 0.0
+        """Of a step, by the last `advance`."""
 
     @property
     def n_views(self) -> int:
@@ -207,12 +210,35 @@ class StreamingFit:
 
     def advance(self, seconds: float) -> Progress:
         """Fit for about `seconds` s (at least one step once there is a model) and return the progress."""
-        return self._advance(seconds, finishing=False)
+        begin = self._now()
+        if self.n_views >= _GROWTH * self._round_views:
+            self._begin_round()
+        if self._state is None or self._problem is None:
+            return self.progress()
+        first = self._state.step
+        while True:
+            view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
+            fit.step(self._state, self._problem, self._settings, self._fraction(), view)
+            average(self._state, self._schedule_step)
+            if (spent := self._now() - begin) >= seconds:
+                self.step_seconds = spent / (self._state.step - first)
+                return self.progress()
 
-    def finish(self, seconds: float, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
-        """Fit a last round over all views, after the scan, with rates that decay to the end in about `seconds` s.
+    @property
+    def last_steps(self) -> int:
+        """Steps of the last round: what the fit lacks of a fit of all views at once, and each view once at least.
 
-        `on_progress` is called about ten times a second and ends the fit by returning True.
+        Never more than such a fit has. So a fit that had to wait for its processor makes up for it.
+        """
+        each_view_once = math.ceil(self.n_views / self._settings.views_per_step)
+        taken = 0 if self._state is None else self._state.step
+        return min(DEFAULT_STEPS, max(each_view_once, DEFAULT_STEPS - taken))
+
+    def finish(self, seconds: float = math.inf, on_progress: Callable[[Progress], bool] | None = None) -> Progress:
+        """Fit a last round over all views, after the scan: `last_steps` steps, but no longer than about `seconds` s.
+
+        The rates decay to its end; density control goes on in its first half. `on_progress` is called about ten times
+        a second and ends the fit by returning True.
 
         Raises:
             ValueError: no view has arrived, or the views hold no matter.
@@ -220,9 +246,24 @@ class StreamingFit:
         if not self._angles:
             raise ValueError("no view has arrived, there is nothing to finish")
         self._begin_round(force=True)
-        if self._state is not None and self._state.mean is not None:  # from the better of the two
-            self._state.parameters = {name: values + 0 for name, values in self._state.mean.items()}
-        return self._advance(seconds, finishing=True, on_progress=on_progress)
+        state, problem = self._state, self._problem
+        assert state is not None and problem is not None
+        if state.mean is not None:  # from the better of the two
+            state.parameters = {name: values + 0 for name, values in state.mean.items()}
+        settled, first = replace(self._settings, policy=None), self._fraction()
+        begun, steps, share = state.step, self.last_steps, 0.0
+        begin = reported = self._now()
+        while share < 1:
+            settings = self._settings if share < _LAST_GROWTH else settled
+            fit.step(state, problem, settings, first + (1 - first) * share)
+            average(state, begun)
+            now = self._now()
+            share = max((state.step - begun) / steps, (now - begin) / seconds if seconds > 0 else 1.0)
+            if on_progress is not None and now - reported > 0.1:
+                reported = now
+                if on_progress(replace(self.progress(), steps=begun + steps)):
+                    break
+        return replace(self.progress(), steps=begun + steps)
 
     def snapshot(self) -> Volume:
         """The current volume, 1/mm; all zero before the first model."""
@@ -241,37 +282,6 @@ class StreamingFit:
         if state is None:
             return Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)
         return Progress(state.step, 0, seconds, state.loss, state.residual, state.n, self.n_views)
-
-    def _advance(
-        self, seconds: float, finishing: bool, on_progress: Callable[[Progress], bool] | None = None
-    ) -> Progress:
-        begin = self._now()
-        if not finishing and self.n_views >= _GROWTH * self._round_views:
-            self._begin_round()
-        if self._state is None or self._problem is None:
-            return self.progress()
-        reported, first = begin, self._fraction()
-        averaged_from = self._state.step if finishing else self._schedule_step
-        settings, settled = self._settings, replace(self._settings, policy=None)
-        while True:
-            spent = self._now() - begin
-            fraction = self._fraction()
-            if finishing and seconds > 0:
-                fraction = first + (1 - first) * min(1.0, spent / seconds)
-                if spent >= _LAST_GROWTH * seconds:
-                    settings = settled
-            view: int | None = None
-            if not finishing:
-                view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
-            fit.step(self._state, self._problem, settings, fraction, view)
-            average(self._state, averaged_from)
-            if on_progress is not None and self._now() - reported > 0.1:
-                reported = self._now()
-                if on_progress(self.progress()):
-                    break
-            if self._now() - begin >= seconds:
-                break
-        return self.progress()
 
     def _fraction(self) -> float:
         assert self._state is not None

@@ -91,7 +91,7 @@ def streamed(scan: Scan, renders: int) -> QualityCurve:
     """A stream that renders so many views while one is taken, and LAST in its last round."""
     data, geometry, truth = scan
     begin, grid = time.process_time(), Grid.matching(geometry)
-    model = StreamingFit(geometry, grid, now=SteppedClock(tick=0.5))  # which counts steps
+    model = StreamingFit(geometry, grid, now=SteppedClock(tick=1.0))  # which counts steps
     share = model.settings.views_per_step
     found = []
     for view in range(VIEWS):

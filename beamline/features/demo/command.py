@@ -37,7 +37,11 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for the folders of runs. Default: storage.folder of configs/demo.yaml.",
 )
-@click.option("--seconds", type=POSITIVE, help="Time of the fit after the scan; a longer fit gives a better volume.")
+@click.option(
+    "--seconds",
+    type=POSITIVE,
+    help="Most time after the scan; less than the fit needs gives a poorer volume.",
+)
 @json_option
 def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     """Scan a simulated battery, reconstruct it during the scan, and compare the volume with the truth.

@@ -13,6 +13,7 @@ import click
 from beamline.cli.options import (
     FiniteRange,
     NameChoice,
+    WholeRange,
     dataset_option,
     json_events,
     json_option,
@@ -91,7 +92,7 @@ class ExportRequest:
         help="Of a film: images a second. A .gif takes the nearest that it can state: 50, 33.3, 25, 20 ...",
     )  # fmt: skip
     side: int = set_by(
-        "--side", type=click.IntRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
+        "--side", type=WholeRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
         help="Of a film: pixels of an image's longer side, at most; pixels are averaged, never enlarged.",
     )  # fmt: skip
     gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
@@ -99,7 +100,7 @@ class ExportRequest:
         "--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads."
     )
     at: int | None = set_by(
-        "--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
+        "--at", type=WholeRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)

@@ -30,7 +30,7 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         yield Finding(
             "error", "partial", f"Partial: {there} are there, the others are empty. recon --resume makes them."
         )
-    if record.parameters.get("ended_early"):
+    if record.ending.early:
         yield Finding("warning", "ended-early", "The reconstruction was stopped early; this is what it had reached.")
     if record.length_unit != "mm":
         yield Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import click
@@ -17,7 +16,7 @@ from beamline.cli.options import (
     volume_argument,
 )
 from beamline.cli.terminal import counting, events_shown
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
 from beamline.features.models.mesh_file import MESHES, write_mesh
@@ -44,11 +43,8 @@ def _mesh_path(text: str) -> Path:
 def surface(volume: Path, output: Path, level: float | None, source: str, dataset: str | None, as_json: bool) -> None:
     """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm where the voxel is known).
 
-    The mesh is watertight: matter that leaves the volume is closed at its faces. Needs: pip install
-    "splatline[surface]". Nothing is overwritten.
+    The mesh is watertight: matter that leaves the volume is closed at its faces. Nothing is overwritten.
     """
-    if importlib.util.find_spec("skimage") is None:
-        raise ConfigError('A surface needs scikit-image: pip install "splatline[surface]". Nothing was written.')
     from beamline.features.models.surface import surface_of_gaussians, surface_of_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})

@@ -7,12 +7,12 @@ import io
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.method_options import method_with, preset_of, settings_of
 from beamline.cli.options import (
     Declared,
     dry_option,
@@ -20,19 +20,15 @@ from beamline.cli.options import (
     json_option,
     name_of,
     option,
-    refuse_contradictions,
-    rules_of,
 )
 from beamline.cli.recipe import names_given
-from beamline.cli.recon import recon
-from beamline.cli.selection_options import chosen
+from beamline.cli.recon import options_of, recon
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.sinks import Warnings
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
-from beamline.reconstruct.option_rules import of_other_methods
 from drivers.base.clock import SystemClock
 from recon.methods import BASELINE
 
@@ -152,30 +148,12 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
 
 
 def _options(context: click.Context) -> ReconOptions:
-    """The options of one reconstruction."""
-    from beamline.reconstruct.options import ReconOptions
+    """The options of one reconstruction, of which no volume is written."""
     from beamline.reconstruct.output_paths import OutputPaths
 
-    values, given = dict(context.params), names_given(context)
-    if foreign := sorted(given & _OF_A_VOLUME):
+    if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
-    refuse_contradictions(recon, given)
-    method = preset_of(values["method"], values["preset"]) or BASELINE
-    if why := of_other_methods(rules_of(recon), given, method, stated=values["method"] is not None):
-        raise click.UsageError(why)
-    source, selection = chosen(values["file"], values["seed"], values)
-    settings = settings_of(recon, values) | {"filter": values["filter"]}
-    return ReconOptions(
-        source=source,
-        target=OutputPaths(Path("slice.h5"), None, written=False),
-        selection=selection,
-        method=method_with(method, settings, values["any_setting"]),
-        quality=values["quality"],
-        device=values["device"],
-        filter=values["filter"],
-        seed=values["seed"],
-        unfinished=values["unfinished"],
-    )
+    return replace(options_of(context, BASELINE), target=OutputPaths(Path("slice.h5"), None, written=False))
 
 
 def _run(

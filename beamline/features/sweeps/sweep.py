@@ -18,7 +18,7 @@ from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
-from beamline.reconstruct.job import compile_kernels, run_on
+from beamline.reconstruct.job import compile_kernels, runner_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import progress_events
@@ -28,8 +28,9 @@ from recon.base.arrays import F32, F64
 from recon.base.empirical import ONE_IN
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance, residuals_by_view
+from recon.voxels.held_out import beyond_chance, unseen_residuals
 from recon.voxels.projector import Projector
+from recon.voxels.resolution import Resolution
 
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
@@ -43,7 +44,7 @@ class SweptSlice:
         image: [y, x] in 1/mm (1/px), the middle slice of the rows.
         seconds: of the reconstruction.
         views: its views held out, corrected as its own options say.
-        projected: [view, row, col] what the volume shows in them.
+        projected: [view, row, col] what the volume shows in them, at this resolution.
     """
 
     values: Mapping[str, str]
@@ -51,6 +52,7 @@ class SweptSlice:
     seconds: float
     views: HeldOutViews
     projected: F32
+    resolution: Resolution
 
     @property
     def label(self) -> str:
@@ -157,9 +159,10 @@ def sweep_slices(
         own = views.prepared if asked.axis_col is None or not of_axes else _about(views.prepared, asked)
         made = swept_slice(options, own, Grid.matching(views.prepared.geometry), sink, clock)
         assert own.held_out is not None
-        projected = Projector(own.held_out[1], made.volume.grid).forward(np.asarray(made.volume.data))
+        projector = Projector(own.held_out[1], made.volume.grid)
+        projected = projector.forward(np.asarray(made.volume.data))
         image = np.array(made.volume.data[made.volume.data.shape[0] // 2])
-        yield SweptSlice(values, image, made.seconds, views, projected)
+        yield SweptSlice(values, image, made.seconds, views, projected, projector.resolution)
         progress(n, len(trials))
 
 
@@ -168,7 +171,7 @@ def swept_slice(
 ) -> Reconstruction:
     compile_kernels(options, prepared.geometry, sink, clock)
     control = RunControl(on_progress=progress_events(sink, clock), now=clock.now)
-    return run_on(options, options.method_for(prepared.geometry), prepared, grid, control)
+    return runner_of(options)(options.method_for(prepared.geometry), prepared, grid, control)
 
 
 def middle_axis(selections: Sequence[Selection]) -> float | None:
@@ -215,16 +218,17 @@ def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
         common = np.intersect1d(common, each.views.ids)
     if len(shapes) > 1 or not common.size:
         return None
-    judges = list({id(each.views): each.views for each in slices}.values())
+    judges = {id(each.views): each for each in reversed(slices)}.values()  # one resolution for all geometries
     residuals = np.zeros((len(slices), common.size))
     scale, alike, first = 0.0, True, slices[0].views
     for judge in judges:
-        measured = judge.data[np.searchsorted(judge.ids, common)]
+        at = np.searchsorted(judge.views.ids, common)
+        measured, resolution = judge.views.data[at], judge.resolution.select(at)
         scale += float(np.sqrt(np.nanmean(np.square(measured, dtype=np.float64))))
         alike &= np.array_equal(measured, first.data[np.searchsorted(first.ids, common)], equal_nan=True)
         for n, each in enumerate(slices):
-            differences = each.projected[np.searchsorted(each.views.ids, common)] - measured
-            by_view = residuals_by_view(differences, measured, each.views.prepared.geometry)
+            model = each.projected[np.searchsorted(each.views.ids, common)].swapaxes(1, 2)
+            by_view = unseen_residuals(model, measured.swapaxes(1, 2), None, resolution)
             if by_view.size != common.size:
                 return None
             residuals[n] += by_view

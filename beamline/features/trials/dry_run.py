@@ -127,9 +127,12 @@ def _memory(trial: Trial, data: TrialData, own_bytes: int) -> int:
     """Bytes: of a process that has loaded the libraries, the views twice (in their file and those used), the rest."""
     method = trial.build()
     coarse = data.geometry.binned(trial.binning)
-    return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
+    weighted = data.prepared.ray_factors() is not None
+    return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), weighted)
 
 
 def _bytes(data: TrialData) -> int:
-    arrays = (data.projections, data.weights, data.truth, data.held_out and data.held_out[0])
+    prepared = data.prepared
+    known, unseen = prepared.projections, prepared.held_out
+    arrays = (known.data, known.weights, prepared.shares, data.truth, unseen and unseen[0])
     return sum(array.nbytes for array in arrays if array is not None)

@@ -1,6 +1,6 @@
 """Plans: which settings of each method a trade-off tries, in which order, and how long the rest will take.
 
-A method without a line in `TRIALS` is tried with its defaults.
+The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -18,12 +17,13 @@ from beamline.core.machine_speed import seconds_left
 from beamline.features.trials.trial import Outcome, Trial
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import Method, Plain, volumes_of
+from recon.base.method import Method, Plain, RepeatedMethod, volumes_of
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, seconds_of
-from recon.methods import by_name
+from recon.methods import METHODS, by_name, has_setting
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
@@ -36,8 +36,6 @@ _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.
 _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
-_PUBLISHED_STEPS = {"quick": (1000,), "full": (3000, 10_000)}
-_FIELD_STEPS = {"quick": (300,), "full": (1000, 3000)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
@@ -63,7 +61,13 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
         gaussians: how many a fit starts from by default.
         depth: "quick" has fewer trials, and shorter ones.
     """
-    return TRIALS.get(method, _baseline)(gaussians, depth)
+    if (lengths := METHODS[method].lengths) is None:
+        return _fits(gaussians, depth) if issubclass(by_name(method), R2) else [TrialSettings("method")]
+    tried: Sequence[int] = getattr(lengths, depth)
+    fixed: dict[str, Plain] = {"gaussians": gaussians} if has_setting(by_name(method), "gaussians") else {}
+    settings = [{lengths.setting: length, **fixed} for length in tried]
+    base, *others = [{}, *settings] if lengths.chosen else settings
+    return [TrialSettings("method", base), *(TrialSettings(lengths.setting, each) for each in others)]
 
 
 def work_of(method: Method, n_views: int, binning: int) -> float:
@@ -72,25 +76,8 @@ def work_of(method: Method, n_views: int, binning: int) -> float:
         count = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians or 0
         spread = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
         return (method.planned_steps or 0) * (1 + count / 2e4 * spread**2)
-    return n_views * (getattr(method, "iterations", None) or 1) / binning**3
-
-
-def _baseline(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    return [TrialSettings("method")]
-
-
-def _iterations(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """Numbers of iterations: the middle one is the baseline."""
-    numbers = {"quick": quick, "full": full}[depth]
-    base = numbers[len(numbers) // 2]
-    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
-    return [TrialSettings("method", {"iterations": base}), *others]
-
-
-def _beside_chosen(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """Numbers of iterations beside the one that the data choose, the baseline."""
-    numbers = {"quick": quick, "full": full}[depth]
-    return [TrialSettings("method"), *(TrialSettings("iterations", {"iterations": n}) for n in numbers)]
+    iterations = method.iterations if isinstance(method, RepeatedMethod) else None
+    return n_views * (iterations or 1) / binning**3
 
 
 def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
@@ -111,33 +98,6 @@ def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     settings += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
     settings.append(TrialSettings("rectification", base | {"fit.rays.rectified": False}))
     return settings
-
-
-def _fields(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    base, *longer = ({"steps": steps} for steps in _FIELD_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
-
-
-def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """The published fit in fewer than its 30 000 steps, which would take a trade-off hours."""
-    base, *longer = ({"steps": steps, "gaussians": gaussians} for steps in _PUBLISHED_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
-
-
-TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
-    "r2": _fits,
-    "r2-published": _published,
-    **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
-    "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
-    "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
-    "osem": partial(_beside_chosen, (3, 12), (1, 3, 6, 12, 50)),
-    "mlem": partial(_beside_chosen, (12, 50), (4, 12, 24, 50, 200)),
-    "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
-    "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
-    "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),
-    "os-sirt-tv": partial(_iterations, (5, 15), (5, 10, 20, 40)),
-    "pnp-dct": partial(_iterations, (35,), (15, 35, 70)),
-}
 
 
 def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:

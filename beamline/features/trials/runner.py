@@ -88,7 +88,7 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         light, facts = light_in(source, asked.light), dict(facts_of(source).table)
-        prepared = prepare_projections(source, asked.selection, warn)
+        prepared = prepare_projections(source, asked.selection, warn).without_warnings
     grid = Grid.matching(prepared.geometry)
     truth = None if truth_given is None else fit_truth(truth_given, grid, asked.selection.binning).data
     facts["volume"] = " × ".join(map(str, grid.shape))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -103,7 +103,7 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
     reference = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
-    data = TrialData(prepared.projections.data, geometry, None, opened.truth, prepared.rays_there(), prepared.emission)
+    data = TrialData(replace(prepared, held_out=None), opened.truth)
     started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
     return data, Planned(table, StudyLayout(options.study), started, reference)
 

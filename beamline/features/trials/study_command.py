@@ -15,6 +15,7 @@ from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
     MethodChoice,
     NameChoice,
+    WholeRange,
     dry_option,
     json_option,
     new_folder_option,
@@ -72,7 +73,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=click.IntRange(min=1, max=100),
+        type=WholeRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",

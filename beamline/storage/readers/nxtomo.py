@@ -38,6 +38,7 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
+from recon.base.arrays import Mask
 
 
 class NXtomoSource(ScanSource):
@@ -69,6 +70,7 @@ class NXtomoSource(ScanSource):
                 self.pixel_size_mm, height = self._geometry.pixel_mm
                 self.row_pitch_mm = differing(height, self.pixel_size_mm)
                 self.cone = self._geometry.cone
+                self.pixel_mask = self._mask(self._geometry.mirrored)
             self.energy_kev = read_energy(places.entry)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
             self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
@@ -93,6 +95,16 @@ class NXtomoSource(ScanSource):
                 "expected a positive distance of the source. Correct it in a copy of the file."
             )
         return sod, sod + beyond
+
+    def _mask(self, mirrored: tuple[bool, bool]) -> Mask | None:
+        """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
+        item = hdf5.dataset(self._places.detector, "pixel_mask")
+        if item is None or item.shape[-2:] != self.shape or item.dtype.kind not in "uib":
+            return None
+        if item.size != self.shape[0] * self.shape[1]:
+            return None
+        mask = np.asarray(hdf5.values_of(item)).reshape(self.shape) != 0
+        return mask[:: -1 if mirrored[0] else 1, :: -1 if mirrored[1] else 1]
 
     def _check(self) -> None:
         finer = hdf5.dataset(self._places.detector, "image_key_control")

@@ -220,7 +220,7 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
     Entry("detector/flatfield_applied", _DONE, False, _true),
     Entry("detector/pixel_mask_applied", "defective pixels are searched", False),
-    Entry("detector/pixel_mask", "defective pixels are searched", False),
+    Entry("detector/pixel_mask", "pixels of whole numbers that are not 0 in it are filled; others are searched"),
     Entry("detector/flatfield", "flats are the frames whose image_key is 1", False),
     Entry("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
     Entry("detector/countrate_correction_applied", "frames are taken as they are", False),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
-from drivers.base.frame import Frame
+from drivers.base.frame import Frame, FrameKind
 
 UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
@@ -27,6 +29,7 @@ class WrappedSource(ScanSource):
         self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
         self.cone, self.axis_col, self.row_pitch_mm = base.cone, base.axis_col, base.row_pitch_mm
         self.in_order, self.numbers, self.frames_per_view = base.in_order, base.numbers, base.frames_per_view
+        self.pixel_mask = base.pixel_mask
 
     def _update(self) -> None:
         """Take over the present frames of `base`."""
@@ -141,6 +144,58 @@ class TurnedSource(WrappedSource):
         )
 
 
+class KeyedSource(WrappedSource):
+    """A ScanSource whose frames are of the kinds that a caller says."""
+
+    def __init__(self, base: ScanSource, kinds: str) -> None:
+        """Take `kinds` such as "darks=0:5,flats=5:10+95:100,views=10:95": rows of the scan, ends not included.
+
+        Without views all other frames are projections, else invalid.
+
+        Raises:
+            DataError: they are no such text, or lie outside the scan.
+        """
+        super().__init__(base)
+        n = int(base.image_key.size)
+        stated, named = np.full(n, -1), _ranges(kinds, n)
+        for kind, first, end in named:
+            if (stated[first:end] >= 0).any():
+                raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
+            stated[first:end] = kind
+        others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
+        self._keys = np.where(stated < 0, others, stated).astype(np.int32)
+        if base.quantity == "unknown" and base.dtype.kind in "ui" and {*self._keys.tolist()} >= {1, 2}:
+            self.quantity = "counts"
+        self._update()
+
+    def _update(self) -> None:
+        super()._update()
+        self.image_key = self._keys
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return self._base.read(frames, rows)
+
+
+_KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
+
+
+def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
+    """Kind and rows [first, end) of each range in `kinds`; DataError for what is none."""
+    ranges = []
+    for word in kinds.split(","):
+        name, _, places = word.strip().partition("=")
+        for place in places.split("+"):
+            match = re.fullmatch(r"\s*(\d{1,9})?:(\d{1,9})?\s*", place)
+            first, end = (int(match[1] or 0), int(match[2] or n)) if match else (0, 0)
+            if name not in _KINDS or not first < end <= n:
+                raise DataError(
+                    f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
+                    "such as darks=0:5,flats=5:10+95:100. Frames are counted from 0 in the order of the scan."
+                )
+            ranges.append((_KINDS[name], first, end))
+    return ranges
+
+
 class UnsignedSource(WrappedSource):
     """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
 
@@ -192,9 +247,14 @@ class PartsSource(WrappedSource):
     Row numbers, such as the row that a frame replaces, count from the first frame of all files.
     """
 
-    def __init__(self, earlier: Sequence[ScanSource], last: ScanSource) -> None:
-        """Put them together; DataError where frames are of another shape or type. It closes all of them."""
-        self._sources = (*earlier, last)
+    def __init__(self, earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> None:
+        """Put them together; DataError where frames are of another shape or type. It closes all of them.
+
+        Args:
+            path: of the scan, where somebody said that the files are one, taken without a pause; None: they are parts,
+                between which beam and camera may have changed.
+        """
+        self._sources, self._one = (*earlier, last), path is not None
         for source in earlier:
             if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
                 raise DataError(
@@ -202,6 +262,8 @@ class PartsSource(WrappedSource):
                     f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
                 )
         super().__init__(last)
+        self.path, self.in_order = path or last.path, all(source.in_order for source in self._sources)
+        self.numbers = None
         self._earlier_flags = [_as_of_today(source) for source in earlier]
         self._update()
 
@@ -233,6 +295,8 @@ class PartsSource(WrappedSource):
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
+        if self._one:
+            return np.zeros(1, np.int64)
         return np.concatenate(
             [s.part_starts + first for s, first in zip(self._sources, self._firsts[:-1], strict=True)]
         )

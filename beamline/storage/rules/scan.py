@@ -18,6 +18,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
 from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.light import views_scaled
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
 
@@ -286,6 +287,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     exposures_agree,
     pixels_measured,
     pixels_as_labelled,
+    views_scaled,
     axis_vertical,
     series_complete,
     scale_known,

@@ -56,7 +56,7 @@ def test_a_beam_that_drifts_from_its_flats_is_levelled_by_its_air(end: float) ->
     assert abs(found.projections.data[:, :, :5].mean()) < 0.005
 
 
-@pytest.mark.parametrize("level", [0.5, 0.68, 1.5])
+@pytest.mark.parametrize("level", [0.68, 1.2])
 def test_a_beam_weaker_than_its_flats_is_levelled_by_its_air(level: float) -> None:
     """As of Diamond's scan, whose one flat is brighter than the open beam; its air is no thinner at the edges."""
     found = prepare_projections(scan(20.0, level), SELECTION, pytest.fail)  # type: ignore[arg-type]
