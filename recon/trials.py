@@ -22,6 +22,9 @@ from recon.voxels.held_out import LEAST_VIEWS, busiest_rows, middle_of_cone, sla
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.projector import Projector, projection_lines
 
+LEFT = "root mean square left of views held out, in line integrals"
+"""What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
+
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 

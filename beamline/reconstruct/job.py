@@ -50,7 +50,7 @@ from recon.warm_up import warm_up
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What leads from a reconstruction to its user and back.
+    """Events, warnings, clock and stop requests of one reconstruction.
 
     Attributes:
         stop_scope: opens what asks for an early end, with the volume so far.

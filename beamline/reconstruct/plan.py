@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from beamline.core.errors import DataError
 from beamline.core.text import size
+from beamline.projections.prepare import refuse_spilled
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import cone_of
 from beamline.reconstruct.error_bars import refuse_views
@@ -73,8 +74,11 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
     """
     allowed, at_once = memory_of(options), needs.at_once
     _refuse_views(source, options, needs.geometry)
+    if options.selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
+        _refuse_region(options, needs.geometry)
     if at_once <= allowed and options.partial is None:
         return _plan(options, needs, allowed)
+    refuse_spilled(source)
     if options.partial is None:
         options.target.refuse_partial()
     if not options.method.traits.several and cone_of(source, options.selection) is not None:
@@ -114,24 +118,29 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
 def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
     """Raise DataError and ConfigError for the geometry of all views, once the axis is known."""
     _refuse_views(source, options, geometry)
+    _refuse_region(options, geometry)
     if options.method.traits.several:
         needs = ReconMemory(options.method, geometry, 0, True)
         if needs.at_once > plan.allowed:
             refuse_whole(source, options, needs, plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
-            f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
+            f"{source.path}: its views are rolled or tilted, and a volume in slabs needs slices aligned with rows. "
             "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
         )
 
 
 def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
-    """Raise DataError and ConfigError for views that are too few, or do not show the region."""
+    """Raise DataError and ConfigError for views that are too few."""
     refuse_few_views(source, options, geometry)
-    if isinstance(options.region, Region):
-        locate(options.region, options.selection, geometry)
     if options.uncertainty:
         refuse_views(options.method_for(geometry), geometry)
+
+
+def _refuse_region(options: ReconOptions, geometry: Geometry) -> None:
+    """Raise ConfigError for a region that lies outside the volume."""
+    if isinstance(options.region, Region):
+        locate(options.region, options.selection, geometry)
 
 
 def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, allowed: int) -> ReconPlan:

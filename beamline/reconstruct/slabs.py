@@ -47,8 +47,8 @@ def prepare_within(
     options.target.require_room(plan.output, plan.scratch + plan.line_integrals)
     if plan.slabs:
         sentence = (
-            f"All at once would take {size(needs.at_once)}, {size(plan.allowed)} of memory may be used: views and "
-            f"volume lie on the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
+            f"All at once would take {size(needs.at_once)}, but {size(plan.allowed)} of memory may be used: working in "
+            f"slabs, with {size(needs.line_integrals + needs.volume)} of scratch files on the output's disk."
         )
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))

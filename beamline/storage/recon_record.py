@@ -74,7 +74,7 @@ class ReconRecord:
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
         series: all volumes, where `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
-        model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
+        model: the Gaussians behind the volume and the geometry of their views (`result.arrays_of_model`); empty: none.
         compared: metrics of FBP of the same views; None without. This and what follows are of a volume that was made
             by this program just now; files do not hold it.
         warnings: sentences.
@@ -120,12 +120,12 @@ class ReconRecord:
 
     @property
     def unit(self) -> str:
-        """Of the voxels; empty for shares."""
+        """Unit of the voxels; empty for shares."""
         return self.kind.unit(self.length_unit)
 
     @property
     def method(self) -> str:
-        """Its name; of a choice, that of the method chosen. Empty in the file of another program."""
+        """Name of the method; with `auto`, of the one that it chose. Empty in a file of another program."""
         return str(self.parameters.get("method", ""))
 
     @property

@@ -358,15 +358,6 @@ class BoundedMethod(Method, Protocol):
 
 
 @runtime_checkable
-class RepeatedMethod(Protocol):
-    """A method with a setting for the number of its iterations."""
-
-    @property
-    def iterations(self) -> int | None:
-        """None: the data choose it."""
-
-
-@runtime_checkable
 class EarlyStopMethod(Protocol):
     """A method that views held out may end early."""
 

@@ -336,7 +336,7 @@ class HeldOutTrial:
         return self._ended
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
-        """`residuals` of the volume of this prior and strength, which is made once."""
+        """`residuals` of the volume of this prior and strength; kept, so that each volume is made once."""
         if (prior, strength) not in self._known:
             self._known[prior, strength] = self.residuals(volume(strength))
         return self._known[prior, strength]

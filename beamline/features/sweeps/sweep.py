@@ -19,6 +19,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, runner_of
+from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.progress import progress_events
@@ -28,10 +29,11 @@ from recon.base.arrays import F32, F64
 from recon.base.empirical import ONE_IN
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance, unseen_residuals
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import Resolution
 
+_FLAT = 0.05  # share by which a residual must change among the values: an axis of 0.7 columns off changed it by 0.03
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
 
@@ -73,7 +75,7 @@ class Scores:
     """How well each slice's volume predicts views held out.
 
     Attributes:
-        residuals: [slice, view] root mean square, as a share of the views' own.
+        residuals: [slice, view] root mean square, as a share of that of all these views.
         corrected_alike: all options give the same views; else each volume is compared with the views by all of them.
     """
 
@@ -81,16 +83,20 @@ class Scores:
     corrected_alike: bool
 
     @property
-    def means(self) -> F64:
-        return np.asarray(self.residuals.mean(axis=1))
+    def shares(self) -> F64:
+        """[slice] the data residual of the views held out, as of `beamline.reconstruct.measure`."""
+        return np.asarray(np.sqrt(np.square(self.residuals).mean(axis=1)))
 
     @property
-    def best(self) -> int:
-        return int(np.argmin(self.means))
+    def best(self) -> int | None:
+        """The slice of the least residual; None where the residual hardly depends on the values."""
+        return int(np.argmin(self.shares)) if np.ptp(self.shares) > _FLAT * self.shares.min() else None
 
     @property
     def alike(self) -> list[bool]:
         """Which slices are told from the best one by no more than chance; also the best one itself."""
+        if self.best is None:
+            return [False] * len(self.residuals)
         best = self.residuals[self.best]
         return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
 
@@ -224,14 +230,14 @@ def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
     for judge in judges:
         at = np.searchsorted(judge.views.ids, common)
         measured, resolution = judge.views.data[at], judge.resolution.select(at)
-        scale += float(np.sqrt(np.nanmean(np.square(measured, dtype=np.float64))))
+        if not np.isfinite(measured).any(axis=(1, 2)).all():
+            return None
         alike &= np.array_equal(measured, first.data[np.searchsorted(first.ids, common)], equal_nan=True)
         for n, each in enumerate(slices):
-            model = each.projected[np.searchsorted(each.views.ids, common)].swapaxes(1, 2)
-            by_view = unseen_residuals(model, measured.swapaxes(1, 2), None, resolution)
-            if by_view.size != common.size:
-                return None
-            residuals[n] += by_view
+            model = each.projected[np.searchsorted(each.views.ids, common)]
+            left, own = squares_left(model, measured, resolution)
+            residuals[n] += np.sqrt(left)
+        scale += float(np.sqrt(own.mean()))
     if scale == 0:
         raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
     return Scores(residuals / scale, alike)

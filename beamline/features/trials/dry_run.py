@@ -20,7 +20,7 @@ from beamline.core.need import Need
 from beamline.core.sinks import Warn, Warnings
 from beamline.core.text import count, size
 from beamline.features.trials.data import TrialData
-from beamline.features.trials.plans import expected_span
+from beamline.features.trials.plans import expected_seconds
 from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import Trial
 from drivers.base.clock import SystemClock
@@ -104,9 +104,10 @@ def dry_run(
     if planned.reference is not None:
         trials = [planned.reference, *trials]
 
+    at_most = expected_seconds(data.geometry, rates)
+
     def expected(trial: Trial) -> ExpectedTrial:
-        span = expected_span(trial, data.geometry, rates)
-        seconds = None if span is None else start + span.most
+        seconds = None if (works := at_most(trial)) is None else start + works
         return ExpectedTrial(label=trial.label, seconds=seconds, memory=_memory(trial, data, own_bytes))
 
     free = shutil.disk_usage(folder.absolute().parent).free

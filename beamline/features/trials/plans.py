@@ -9,28 +9,26 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from functools import cache
+from typing import Literal
 
 import numpy as np
 
-from beamline.core.machine_speed import seconds_left
 from beamline.features.trials.trial import Outcome, Trial
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import Method, Plain, RepeatedMethod, volumes_of
+from recon.base.method import Plain
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, seconds_of
 from recon.methods import METHODS, by_name, has_setting
-from recon.splatting.fit_method import FitMethod
-from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
+Expected = Callable[[Trial], float | None]
+"""s of a trial; None: not known."""
 
 _WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
-_WORK_OF_MOTION: Mapping[Any, int] = {False: 2, True: 3, None: 5}
-"""A rough measure of the work of a series by its `moves`. Views held out choose in a trial of each."""
 _LEAST_OF_PART = 6  # views
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 _BASE_STEPS = {"quick": 250, "full": 1000}
@@ -70,16 +68,6 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
     return [TrialSettings("method", base), *(TrialSettings(lengths.setting, each) for each in others)]
 
 
-def work_of(method: Method, n_views: int, binning: int) -> float:
-    """A rough measure of the time that a run takes, to be compared within one method only."""
-    if isinstance(method, FitMethod):
-        count = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians or 0
-        spread = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
-        return (method.planned_steps or 0) * (1 + count / 2e4 * spread**2)
-    iterations = method.iterations if isinstance(method, RepeatedMethod) else None
-    return n_views * (iterations or 1) / binning**3
-
-
 def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     base: dict[str, Plain] = {"steps": _BASE_STEPS[depth], "gaussians": gaussians}
     settings = [TrialSettings("method", base)]
@@ -101,7 +89,7 @@ def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
 
 
 def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
-    """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
+    """The trials, one setting varied at a time about each method's baseline; baselines first.
 
     Args:
         methods: names in `recon.methods`, in the order wanted.
@@ -122,7 +110,17 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
         first.append(replace(base, halves=True))
         rest += [replace(base, group="views", views=n) for n in counts]
         rest += others
-    return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
+    return tuple(dict.fromkeys([*first, *rest]))
+
+
+def quick_first(trials: Sequence[Trial], expected: Expected) -> tuple[Trial, ...]:
+    """The trials with baselines first, then those that take least time, and those whose time is not known."""
+
+    def order(trial: Trial) -> tuple[bool, float]:
+        varied = trial.group != "method"
+        return varied, (expected(trial) or math.inf) if varied else 0.0
+
+    return tuple(sorted(trials, key=order))
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
@@ -145,7 +143,7 @@ def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: 
     """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
     alone = _baselines(methods, n_views, gaussians)
     numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
-    settings: list[dict[str, Plain | None]] = [{"volumes": volumes, "moves": moves} for moves in _WORK_OF_MOTION]
+    settings: list[dict[str, Plain | None]] = [{"volumes": volumes, "moves": moves} for moves in (False, True, None)]
     jointly = [Trial("one fit", "series", n_views, settings=each) for each in settings]
     return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *jointly
 
@@ -170,15 +168,6 @@ def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Tri
     ]
 
 
-def work(trial: Trial) -> float:
-    """A rough number for how long a trial takes, to be compared within one method only."""
-    method = trial.build()
-    if method.traits.several:
-        of_motion, share = _WORK_OF_MOTION[trial.settings.get("moves", False)], "states" in trial.settings
-        return float(trial.views * volumes_of(method) * of_motion * (1 + share))
-    return work_of(method, trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
-
-
 @dataclass(frozen=True)
 class Timed:
     """A trial that is done, and where its time went.
@@ -199,14 +188,19 @@ class Timed:
         return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
-def expected_span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
-    """s that a trial on some of these views reconstructs.
+def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
+    """s that a trial on some of these views reconstructs, at most.
 
     None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
     """
-    with suppress(ValueError):
-        return _span(trial, geometry, rates)
-    return None
+
+    @cache
+    def of_trial(trial: Trial) -> float | None:
+        with suppress(ValueError):
+            return None if (span := _span(trial, geometry, rates)) is None else span.most
+        return None
+
+    return of_trial
 
 
 def _span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
@@ -226,43 +220,29 @@ def _span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
     return Span(*(min(limit, sum(ends)) for ends in zip(*spans, strict=True)))
 
 
-def trials_left(
-    done: Sequence[Timed], trials: Sequence[Trial], expected: Callable[[Trial], float | None] = lambda trial: None
-) -> float | None:
+def trials_left(done: Sequence[Timed], trials: Sequence[Trial], expected: Expected) -> float | None:
     """s that the trials to come will take, from those done; None before the first.
 
-    Each takes the same time to start and measure, and what is expected of it, at the pace of the trials that are done.
-    Where nothing is expected of a trial, it takes what those of its method did by their work, or what all did.
-
-    Args:
-        expected: s of a trial; None: not known.
+    Each takes the same time to start and measure, and what is expected of it, at the pace of its method's trials that
+    are done, or of all. One of which nothing is expected takes what those of its method did, or all.
     """
     if not done:
         return None
-    fixed = sum(each.wall - each.working for each in done) / len(done)
-    told = [
-        (seconds, each.working)
-        for each in done
-        if each.working > 0 and not each.trial.direct and (seconds := expected(each.trial))
-    ]  # a direct method is over too soon to tell how fast this machine is
-    amount, spent = (sum(values) for values in zip(*told, strict=True)) if told else (1.0, 1.0)
-    total = 0.0
+    total = len(trials) * sum(each.wall - each.working for each in done) / len(done)
+    # a direct method is over too soon to tell how fast this machine is
+    pace = _pace([each for each in done if not each.trial.direct], expected) or 1.0
     for trial in trials:
-        total += fixed
         same = [each for each in done if each.trial.method == trial.method and each.working > 0]
         if trial.seconds_asked is not None:
             total += trial.seconds_asked
-        elif same:
-            shares = [_share(each.trial, trial, expected) for each in same]
-            total += seconds_left(sum(shares), sum(shares) + 1, sum(each.working for each in same)) or 0.0
         elif (seconds := expected(trial)) is not None:
-            total += seconds * spent / amount
+            total += seconds * (_pace(same, expected) or pace)
         else:
-            total += sum(each.working for each in done) / len(done)
+            total += sum(each.working for each in same or done) / len(same or done)
     return total
 
 
-def _share(done: Trial, trial: Trial, expected: Callable[[Trial], float | None]) -> float:
-    """What a trial took of the time of another one of the same method: as expected, else by their work."""
-    of_done, of_trial = expected(done), expected(trial)
-    return of_done / of_trial if of_done and of_trial else work(done) / work(trial)
+def _pace(done: Sequence[Timed], expected: Expected) -> float | None:
+    """What trials took over what was expected of them; None where nothing was."""
+    told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
+    return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None

@@ -102,7 +102,7 @@ def study(request: StudyRequest) -> None:
     """
     from beamline.features.trials.layout import text
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.study import StudyLayout, StudyOptions, planned_study, run_study
+    from beamline.features.trials.study import StudyOptions, layout_of, planned_study, run_study
 
     methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
@@ -135,7 +135,7 @@ def study(request: StudyRequest) -> None:
     with events_shown(request.as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not request.as_json:
-        click.echo(text(table, StudyLayout(STUDIES[request.which])))
+        click.echo(text(table, layout_of(STUDIES[request.which])))
         click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)}"

@@ -13,16 +13,19 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Sink, TradeoffStarted
 from beamline.core.files import refuse_existing
 from beamline.core.machine import machine
+from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.energies.scans import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.data import TrialData
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.plans import (
     Depth,
+    expected_seconds,
     plan,
     plan_in_equal_time,
     plan_in_time,
     plan_of_energies,
+    quick_first,
     telling_first,
 )
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
@@ -127,7 +130,9 @@ def _of_one_volume(options: TradeoffOptions, warn: Warn) -> Comparison:
     facts = {**opened.facts, "views used": str(n)}
     methods, seconds = options.methods or names_compared(data.prepared.emission is not None), options.seconds
     trials = (
-        plan(methods, n, start, options.depth) if seconds is None else plan_in_equal_time(methods, n, start, seconds)
+        quick_first(plan(methods, n, start, options.depth), expected_seconds(data.geometry, MachineSpeed()))
+        if seconds is None
+        else plan_in_equal_time(methods, n, start, seconds)
     )
     return data, trials, _table(options, facts, opened.prepared.length_unit, opened.light)
 
