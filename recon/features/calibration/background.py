@@ -172,7 +172,8 @@ class _Views:
         if leaves_the_field(data, views):
             grid = Grid.for_fit(views, grid, wider=True)
         terms = np.array([[_surface(one, time, shape, factor) for time in times[some]] for one in np.eye(len(TERMS))])
-        return cls(data, terms, weight, Projector(views, grid), times[some])
+        # A background is smooth: thresholds on what views held out gain were found without sharpening.
+        return cls(data, terms, weight, Projector(views, grid).plain, times[some])
 
     def select(self, numbers: NDArray[np.intp]) -> _Views:
         weight = None if self.weight is None else self.weight[numbers]
