@@ -19,7 +19,7 @@ from recon.splatting.finish import Candidates
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
-from recon.trials import ROWS, part_of, predicts_best
+from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import Fbp
 from recon.voxels.held_out import TRIAL_ROWS
 from recon.voxels.methods.fista_tv import FistaTv
@@ -37,8 +37,8 @@ class Auto:
 
     The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
     and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
-    settings of their own, each is run on 32 rows, or on all of them at half the resolution. There is no trial with
-    fewer than 16 views: the last one takes these. docs/choosing.md has reasons.
+    settings of their own, each is run on 32 rows, or on all of them at half the resolution. Trials need at
+    least 16 views; with fewer the last candidate is used. docs/choosing.md has reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
@@ -58,7 +58,7 @@ class Auto:
             raise ValueError("candidates must be at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
+        """The result of the chosen method, with the reason.
 
         Raises:
             ValueError: no candidate takes these views or data.
@@ -71,7 +71,7 @@ class Auto:
         device = problem.device if chosen.traits.device else "cpu"
         result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": because}
-        return replace(result, settings=settings, method=chosen.name)
+        return replace(result, settings=settings, method=chosen.name, chosen=because)
 
     def choose(self, problem: ReconProblem, control: RunControl, decide: Decisions) -> tuple[int, str, bool]:
         """Number of the chosen method, the reason, and whether there were trials.
@@ -92,14 +92,14 @@ class Auto:
                 named = zip(self.candidates, residuals, strict=True)
                 listed = "; ".join(f"{method.name} {each:.4g}" for method, each in named if each < math.inf)
                 rows = min(TRIAL_ROWS, problem.geometry.detector_shape[0])
-                return int(np.argmin(residuals)), f"residual of views held out, {rows} rows: {listed}", True
+                return int(np.argmin(residuals)), f"trials on {rows} rows, {LEFT}: {listed}", True
         part, where = part_of(problem)
         if part is None:
             return last, where, False
         at, because = predicts_best(part, self.candidates, control)
         if at is None:
             return last, because, False
-        return at, f"residual of views held out, {where}: {because}", True
+        return at, f"trials on {where}, {LEFT}: {because}", True
 
     @property
     def _fit(self) -> FitMethod | None:
@@ -133,8 +133,12 @@ class Auto:
 
 def _judged_beside(method: Method) -> bool:
     """The trial of a fit judges this method, too."""
-    given = getattr(method, "tv_weight", None), getattr(method, "patch_threshold", None)
-    return isinstance(method, Fbp | FistaTv | PnpDct) and given == (None, None)
+    match method:
+        case FistaTv():
+            return method.tv_weight is None
+        case PnpDct():
+            return method.patch_threshold is None
+    return isinstance(method, Fbp)
 
 
 def _residual(method: Method, tried: Candidates) -> float:

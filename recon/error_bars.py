@@ -14,11 +14,11 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Method, Progress, ReconProblem, RunControl
+from recon.base.method import Method, Progress, ReconProblem, RunControl, SignedMethod
 from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
-from recon.voxels.direct import direct
+from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import IterativeMethod, Watch, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
@@ -84,7 +84,10 @@ def error_bars(
         known = ", ".join(with_trait("error_bars"))
         raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"error bars need {LEAST_VIEWS} views, in two halves; here are {geometry.n_views}")
+        raise ValueError(
+            f"error bars split the views into two halves: at least {LEAST_VIEWS} views are needed, "
+            f"got {geometry.n_views}"
+        )
     method = method_on_voxels(method, decided)
     factors = method.traits.error_bars
     assert factors is not None
@@ -143,7 +146,7 @@ def _alternating(method: Method, problem: ReconProblem) -> F32:
     """Half the difference of the FBPs of both halves of the views."""
     filled = masked(problem.projections, problem.use.weights)[0]
     signed = filled * alternating(problem.geometry)[:, None, None]
-    return direct(signed, problem.geometry, problem.grid, getattr(method, "filter", "hann"))
+    return direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
 
 
 def _refitted(
@@ -173,7 +176,8 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve(
             refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
-            nonnegative=not getattr(method, "allow_negative", False), watch=Watch(told), decide=decide,
+            nonnegative=not (isinstance(method, SignedMethod) and method.allow_negative), watch=Watch(told),
+            decide=decide,
         )  # fmt: skip
         if stopped:
             return None

@@ -12,15 +12,21 @@ from typing import Any
 
 from recon.base.choices import AUTO
 from recon.base.method import Method
-from recon.base.method_entry import MethodEntry
+from recon.base.method_entry import Lengths, MethodEntry
 from recon.base.registry import Registry, in_folders, unknown
 
 REGISTRY: dict[str, MethodEntry] = {
     "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
     "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
-    "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
-    "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
-    "pnp-dct": MethodEntry("recon.voxels.methods.pnp_dct", "PnpDct"),
+    "fista-tv": MethodEntry(
+        "recon.voxels.methods.fista_tv", "FistaTv", lengths=Lengths("iterations", (20, 5), (20, 5, 10, 40))
+    ),
+    "os-sirt-tv": MethodEntry(
+        "recon.voxels.methods.os_sirt_tv", "OsSirtTv", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
+    ),
+    "pnp-dct": MethodEntry(
+        "recon.voxels.methods.pnp_dct", "PnpDct", lengths=Lengths("iterations", (35,), (35, 15, 70))
+    ),
     **in_folders("recon.features", "METHODS"),
 }
 

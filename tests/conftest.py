@@ -93,11 +93,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def _kernels_are_carried() -> bool:
     """All of these sources, compiled for this processor: nothing is left to compile."""
     archive = archive_of(sys.version_info[:2])
-    if (
-        "NUMBA_CACHE_DIR" in os.environ
-        or not archive.is_file()
-        or level_for(os.environ, processor_flags()) not in LEVELS
-    ):
+    if not archive.is_file() or level_for(os.environ, processor_flags()) not in LEVELS:
         return False
     return set(read_sources(archive)) == set(fresh_members(archive, ROOT))
 

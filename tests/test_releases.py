@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import yaml
 
-from beamline.storage import journal
 from beamline.storage.readers import tiff
 from beamline.storage.writers import checkpoint
 from tests.licences import FOR_DEVELOPERS, FOR_USERS
@@ -48,6 +47,6 @@ def test_the_page_lists_the_extras_of_users(project: dict[str, Any]) -> None:
     assert re.findall(r"(?m)^\| `(\w+)` \|", PAGE) == list(FOR_USERS)
 
 
-@pytest.mark.parametrize("marker", [checkpoint._FORMAT, journal._FORMAT, tiff.VOLUME])
+@pytest.mark.parametrize("marker", [checkpoint._FORMAT, tiff.VOLUME])
 def test_the_page_names_each_format_of_ours(marker: str) -> None:
     assert f"`{marker}`" in PAGE

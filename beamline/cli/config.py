@@ -19,8 +19,11 @@ def config() -> None:
 
 @config.command(short_help="Print a configuration template to edit.")
 @click.option("--instrument", is_flag=True, help="A template for a real instrument instead of simulated devices.")
-def init(instrument: bool) -> None:
+@click.argument("file", metavar="", required=False)
+def init(instrument: bool, file: str | None) -> None:
     """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
+    if file is not None:
+        raise click.UsageError(f"config init prints a configuration and writes no file: beamline config init > {file}")
     from beamline.config.load import config_folder
 
     name = "instrument.yaml" if instrument else "simulated.yaml"

@@ -15,12 +15,15 @@ def _command(verb: str, help_text: str) -> click.Command:
     """The command of a `beamline.scan.control.Verb`; `help_text` begins its help."""
 
     @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
-    @click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
+    @click.argument("run", required=False, type=click.Path(path_type=Path))
     def send(run: Path | None) -> None:
         from beamline.config.models import StorageSection  # here: help does not need it
         from beamline.scan.control import Verb, tell
 
-        run = run or _only(Path(StorageSection.model_fields["folder"].default))
+        runs = Path(StorageSection.model_fields["folder"].default)
+        if run is not None and not run.is_dir():
+            raise ConfigError(f"there is no folder {run}; {_running_in(runs)}. Nothing was changed.")
+        run = run or _only(runs)
         click.echo(f"{run}: {tell(run, Verb(verb))}")
 
     return send
@@ -40,6 +43,16 @@ abort = _command(
 )
 
 
+def _running_in(runs: Path) -> str:
+    """Which scans run in a folder, without a full stop."""
+    from beamline.scan.control import running
+
+    names = [run.name for run in running(runs)]
+    if not names:
+        return f"no scan runs in {runs}"
+    return f"{len(names)} {'scan runs' if len(names) == 1 else 'scans run'} in {runs}: {', '.join(names)}"
+
+
 def _only(runs: Path) -> Path:
     """The one run in a folder that goes on."""
     from beamline.scan.control import running
@@ -47,8 +60,4 @@ def _only(runs: Path) -> Path:
     running_scans = running(runs)
     if len(running_scans) == 1:
         return running_scans[0]
-    if running_scans:
-        raise ConfigError(
-            f"{len(running_scans)} scans run in {runs}: {', '.join(run.name for run in running_scans)}. Name one."
-        )
-    raise ConfigError(f"no scan runs in {runs}. Name the folder of the run. Nothing was changed.")
+    raise ConfigError(f"{_running_in(runs)}. Name the folder of the run. Nothing was changed.")

@@ -11,15 +11,26 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
-from beamline.cli.options import POSITIVE, NameChoice, declared, option, parsed, rules_of, run_option, together
+from beamline.cli.options import (
+    POSITIVE,
+    NameChoice,
+    WholeRange,
+    declared,
+    option,
+    parsed,
+    rules_of,
+    run_option,
+    together,
+)
 from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
-from recon.base.empirical import DEFAULT_STEPS, MODEL_STEPS
+from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
 from recon.methods import DEFAULT, build, by_name, has_setting, names, taking
+from recon.splatting.settings import MODEL_STEPS
 
 PRESETS_OF_METHODS = ("published",)
 """Endings of names of methods that are variants of another method, such as r2-published."""
@@ -142,24 +153,24 @@ preset_option = option(
 )
 _STEPS = run_option(
     "--steps",
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
     f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
 )
 _GAUSSIANS = run_option(
     "--gaussians",
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Number of Gaussians at the start.",
 )
 _FINISH = run_option(
     "--finish",
-    type=click.IntRange(min=0),
+    type=WholeRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
     "with sparse patches where views held out are predicted better so.",
 )
 _ITERATIONS = run_option(
     "--iterations",
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
 _TV_WEIGHT = run_option(
@@ -183,7 +194,7 @@ _IN_TIME = together(
     run_option(
         "--time",
         "volumes",
-        type=click.IntRange(min=2),
+        type=WholeRange(min=2),
         metavar="N",
         help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",

@@ -41,6 +41,17 @@ class FiniteRange(click.FloatRange):
         return "" if self.min is None and self.max is None else super()._describe_range()
 
 
+class WholeRange(click.IntRange):
+    """A range of whole numbers; click's own names its type where another number is given, and not the range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            int(value)
+        except ValueError:
+            self.fail(f"{value!r} is no whole number; expected one of {self._describe_range()}.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 class NameChoice(click.Choice):  # type: ignore[type-arg]
     """Some names; an error names the nearest one."""
 
@@ -76,7 +87,7 @@ _ELSEWHERE = {
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
-SEED = click.IntRange(min=0)
+SEED = WholeRange(min=0)
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 

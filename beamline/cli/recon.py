@@ -2,39 +2,35 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from beamline.cli.log import LogLines, logged
-from beamline.cli.method_options import (
-    method_with,
-    preset_of,
-    resumes_slabs,
-    settings_of,
-)
+from beamline.cli.method_options import method_with, preset_of, resumes_slabs, settings_of
 from beamline.cli.option_groups import Grouped
-from beamline.cli.options import (
-    json_events,
-    refuse_contradictions,
-    refuse_shared,
-    require_there,
-    rules_of,
-)
+from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, require_there, rules_of
 from beamline.cli.recipe import names_given, recipe_text, repeating
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
-from beamline.cli.terminal import events_shown, results
-from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Event, FitReached, StateEntered
-from beamline.core.files import refuse_existing, write_whole
+from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
+from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
+from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
+from beamline.core.files import named_on_failure, refuse_existing, write_whole
+from beamline.core.narration import sentence
 from beamline.core.process import EndsWithParent
-from beamline.core.sinks import fan_out
+from beamline.core.shipped import version
+from beamline.core.sinks import fan_out, while_it_works
 from beamline.core.stop import StopOnSignal
+from beamline.core.text import printable
 from beamline.reconstruct.option_rules import RULES, SLABS_RESUMED, of_other_methods
+from beamline.scan.run_folder import new_log
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
@@ -42,6 +38,54 @@ from recon.methods import DEFAULT, IN_TIME
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
     from beamline.storage.recon_record import ReconRecord
+
+
+class LogLines:
+    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence.
+
+    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
+    """
+
+    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
+        self._stream, self._lock = stream, threading.Lock()
+        self._ignored = closed_terminal_ignored if terminal else nullcontext
+
+    def __call__(self, event: Event) -> None:
+        text = None if isinstance(event, ReconStarted) else sentence(event)
+        if text is None:
+            text = ", ".join(f"{name} {value}" for name, value in event.data.items())
+        at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
+        with self._lock, self._ignored():
+            self._stream.write(f"{at}  {event.event}: {printable(' '.join(text.split()))}\n")
+            self._stream.flush()
+
+
+@contextmanager
+def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
+    """The sink that writes a log, if one is requested. An error in the block becomes its last line.
+
+    If its disk is full, `warn` gets a warning, and the work goes on.
+    """
+    if path is None:
+        yield []
+        return
+    refuse_existing(path)
+    with ExitStack() as closing:
+        with named_on_failure(path):
+            file = closing.enter_context(new_log(path))
+        write = LogLines(file)
+
+        def named(event: Event) -> None:
+            with named_on_failure(path):
+                write(event)
+
+        lines = while_it_works(named, warn)
+        lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
+        try:
+            yield [lines]
+        except (Exception, KeyboardInterrupt) as error:
+            lines(Failed(user_message(error), time=SystemClock().now()))
+            raise
 
 
 @click.command(
@@ -55,8 +99,8 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
     and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
-    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs
-    keeps those that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
+    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. Finished
+    slabs of a large volume are kept, even after a kill, in OUTPUT.partial.h5; --resume goes on from there.
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
@@ -81,11 +125,21 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
         run_reconstruction(options, values)
 
 
-def _checked_method(context: click.Context, method: str | None, slabs: Path | None) -> str:
+def options_of(context: click.Context, default: str = "") -> ReconOptions:
+    """The options of the reconstruction that a context of `recon` asks for; see `_checked_method`."""
+    values = dict(context.params)
+    file, method, output = (values.pop(name) for name in ("file", "method", "output"))
+    slabs = values["resume"] if resumes_slabs(values["resume"]) else None
+    method = _checked_method(context, method, slabs, default)
+    return _options(context, file, method, output or Path(f"{file.stem}_{method}.h5"), values)
+
+
+def _checked_method(context: click.Context, method: str | None, slabs: Path | None, default: str = "") -> str:
     """The method's name, after all options were found to go together and with it.
 
     Args:
         slabs: partial volume that --resume names.
+        default: the method where none is named; empty: the usual one for such options.
 
     Raises:
         UsageError: they do not.
@@ -99,7 +153,7 @@ def _checked_method(context: click.Context, method: str | None, slabs: Path | No
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
-        method = _in_time() if "time" in asked else DEFAULT if of_fits else AUTO
+        method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {slabs}"})
     if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
@@ -200,7 +254,7 @@ def run_reconstruction(
     output = " and ".join(map(str, options.target.outputs))
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
-    if lost := record.parameters.get("checkpoint_lost"):
+    if lost := record.ending.lost_checkpoint:
         raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
     if record.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")

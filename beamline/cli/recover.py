@@ -19,8 +19,8 @@ def recover(file: Path, as_json: bool) -> None:
     """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
 
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
-    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. What changes is
-    written to FILE.journal first, so that this can be run again after whatever stopped it; it says what room it needs.
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. It can be
+    run again after whatever stopped it, needs no room for a copy, and says what room it needs.
     """
     from beamline.scan.resume import recover_run
     from beamline.scan.run_folder import SCAN

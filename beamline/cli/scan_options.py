@@ -54,6 +54,27 @@ scan_options = together(
         metavar="DATASET",
         help="For any HDF5 file: its angles, one for each projection or frame, in the unit that the dataset states.",
     ),
+    option(
+        "--frames",
+        metavar="KINDS",
+        help="Of which kind frames are, whatever names and keys say: darks=0:5,flats=5:10+95:100. Others are views.",
+    ),
+    option(
+        "--then",
+        of_one_call=True,
+        multiple=True,
+        type=_PATH,
+        metavar="FILE",
+        help="A further file of the same scan, whose frames follow. May be repeated.",
+    ),
+    option(
+        "--from",
+        "side_file",
+        of_one_call=True,
+        type=_PATH,
+        metavar="FILE",
+        help="File of the scanner's maker beside the images (.xtekct, .log, .pca, .xml): distances, pixels, angles.",
+    ),
     option("--angles-unit", type=NameChoice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."),
 )
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""

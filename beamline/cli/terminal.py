@@ -262,7 +262,7 @@ def results(record: ReconRecord) -> str:
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
             label = metric.label
-            if name == "seconds" and record.parameters.get("resumed_from"):
+            if name == "seconds" and record.ending.resumed_from:
                 label += ", since resumed"
             lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
     return "\n".join(lines)

@@ -129,8 +129,8 @@ class ReferenceFault:
 
 
 @dataclass(frozen=True)
-class JudgedGroup:
-    """A group of references, taken together.
+class GroupVerdict:
+    """What the checks found of a group of references.
 
     Attributes:
         kind: DARK or FLAT.
@@ -154,7 +154,9 @@ class JudgedGroup:
 Group = Sequence[ReferenceFrame]
 
 
-def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()) -> tuple[JudgedGroup, ...]:
+def judge(
+    groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
+) -> tuple[GroupVerdict, ...]:
     """Judge groups of darks and flats, each by itself and beside the others.
 
     Args:
@@ -181,7 +183,7 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
             if not any(faults):
                 faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
         rows = tuple(reference.row for reference in group)
-        judged.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
+        judged.append(GroupVerdict(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
     return tuple(judged)
 
 
@@ -221,6 +223,8 @@ def full_scale(largest: float) -> float:
 
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
+    if all(_of_one_number(frame) for frame in (*flats, *(darks or ()))):
+        return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score = float(np.median([flat.saturated for flat in flats])) - hot
     if score <= limits.saturated:
@@ -230,6 +234,10 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
         "Shorten the exposure or add a filter."
     )
     return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
+
+
+def _of_one_number(frame: ReferenceFrame) -> bool:
+    return bool(np.ptp(frame.blocks) == 0)
 
 
 def _clipped(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:

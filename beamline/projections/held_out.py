@@ -8,7 +8,7 @@ import numpy as np
 
 from beamline.core.errors import ConfigError
 from beamline.projections.prepared import PreparedProjections
-from recon.base.arrays import F32
+from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 
 Views = tuple[F32, Geometry]
@@ -40,29 +40,23 @@ def hold_out(
     """
     if prepared.held_out is not None:
         return prepared
-    n, geometry, projections = prepared.geometry.n_views, prepared.geometry, prepared.projections
+    n = prepared.geometry.n_views
     count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
-    counted, emission = projections.weights, prepared.emission
+    # Neither the first nor the last: they have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
-    used = np.setdiff1d(np.arange(n), held)
+    return with_views_held_out(prepared, held)
+
+
+def with_views_held_out(prepared: PreparedProjections, held: I64) -> PreparedProjections:
+    """The same with the views of these numbers held out, sorted."""
+    projections, counted = prepared.projections, prepared.projections.weights
     return replace(
-        prepared,
-        projections=replace(
-            projections,
-            data=projections.data[used],
-            view_ids=projections.view_ids[used],
-            air=projections.air[used],
-            weights=None if counted is None else counted[used],
-        ),
-        geometry=geometry.select(used),
-        view_weights=None if prepared.view_weights is None else prepared.view_weights[used],
-        shares=None if prepared.shares is None else prepared.shares[used],
-        emission=emission and emission.summed(used[:, None], geometry.select(used)),
-        held_out=(projections.data[held], geometry.select(held)),
+        prepared.of_views(np.setdiff1d(np.arange(prepared.geometry.n_views), held)),
+        held_out=(projections.data[held], prepared.geometry.select(held)),
         held_out_ids=projections.view_ids[held],
         held_out_weights=None if counted is None else counted[held],
     )

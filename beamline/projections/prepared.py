@@ -13,6 +13,7 @@ from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.recon_record import Value
+from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.method import Energies
@@ -50,6 +51,7 @@ class PreparedProjections:
         times: [view] s when each was exposed; None: no method asked for it.
         energies: of the views, where they are of several scans; None: they are of one.
         recorded: what the volume's file says of several scans, by name; empty of one.
+        laws: what the views leave of the laws that hold for all of them, in words, by name.
         stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
@@ -75,6 +77,7 @@ class PreparedProjections:
     energies: Energies | None = None
     recorded: Mapping[str, Value] = field(default_factory=dict)
     stretch: float = 1.0
+    laws: Mapping[str, str] = field(default_factory=dict)
 
     def stretched(self, volume: Volume) -> Volume:
         """A volume of `geometry` at the heights of its slices."""
@@ -115,6 +118,30 @@ class PreparedProjections:
             shares_of=None,
         )
 
+    def of_views(self, views: I64) -> PreparedProjections:
+        """Some of the views used, by number, in this order; those held out stay as they are."""
+
+        def some(array: Any) -> Any:
+            return None if array is None else array[views]
+
+        whole, geometry, energies = self.projections, self.geometry.select(views), self.energies
+        return replace(
+            self,
+            projections=replace(
+                whole,
+                data=whole.data[views],
+                view_ids=whole.view_ids[views],
+                air=whole.air[views],
+                weights=some(whole.weights),
+            ),
+            geometry=geometry,
+            view_weights=some(self.view_weights),
+            shares=some(self.shares),
+            emission=self.emission and self.emission.summed(views[:, None], geometry),
+            times=some(self.times),
+            energies=energies and replace(energies, of_view=energies.of_view[views]),
+        )
+
     @property
     def leaves_slices(self) -> bool:
         """Views of a parallel beam see beyond the slices of the volume, since they move along it or lean."""
@@ -126,9 +153,10 @@ class PreparedProjections:
         factors = self.ray_factors(others)
         return None if factors is None else factors[...]
 
-    def rays_there(self, others: int = 0) -> NDArray[np.float32] | None:
-        """As `ray_weights`, without what the monitor says of views: 0 where nothing was measured."""
-        return replace(self, view_weights=None, shares=None, shares_of=None).ray_weights(others)
+    @property
+    def without_warnings(self) -> PreparedProjections:
+        """The same without what the monitor says of views: rays that were not measured weigh 0, all others as usual."""
+        return replace(self, view_weights=None, shares=None, shares_of=None)
 
     def ray_factors(self, others: int = 0) -> RayWeights | None:
         """Weights [view, row, col], computed only where they are asked for; None: one for all rays.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol, runtime_checkable
 
 from beamline.projections.step import NamedStep, StepDone, StepMemory
 
@@ -85,6 +85,13 @@ class ViewStep(PrepStep, Protocol):
         """
 
 
+@runtime_checkable
+class BlurringStep(Protocol):
+    """A step that blurs the views: what looks for fine detail leaves it out."""
+
+    blurs: ClassVar[Literal[True]]
+
+
 class ViewMotion(Protocol):
     """Where the sample was in the views of a scan.
 
@@ -136,6 +143,15 @@ class PlaceStep(PrepStep, Protocol):
             usable: the views that may be used.
             progress: takes how much is done, and of how much at most.
         """
+
+
+@runtime_checkable
+class JumpStep(Protocol):
+    """A step that knows of jumps of the sample."""
+
+    @property
+    def corrects_jumps(self) -> bool:
+        """It corrects views for them, in a finished scan."""
 
 
 @runtime_checkable

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.monitor.aside import Aside
+from beamline.monitor.change import SPAN
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import check_block, digest
@@ -29,6 +29,47 @@ from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 
+
+@dataclass(frozen=True)
+class SkippedChecks:
+    """Counts of views with light so far, and of those that checks skipped.
+
+    Attributes:
+        views: their number.
+        alone: views that were not compared with earlier ones.
+        without_flats, cones, wider: views of a scan without flats, of a cone beam, of a sample wider than the field.
+    """
+
+    views: int = 0
+    alone: int = 0
+    without_flats: int = 0
+    cones: int = 0
+    wider: int = 0
+
+    def with_frame(self, context: ScanContext) -> SkippedChecks:
+        """After the next frame; the checks knew `context` of it."""
+        if context.view is None or context.grid is None:
+            return self
+        return SkippedChecks(
+            self.views + 1,
+            self.alone + (context.change is None),
+            self.without_flats + (not context.grid.flats),
+            self.cones + context.cone,
+            self.wider + (context.truncated and context.grid.flats),
+        )
+
+    def in_words(self) -> tuple[str, ...]:
+        """Checks, views and reason, a text each. First views, which have no earlier ones, count only if all do."""
+        alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
+        reasons = (
+            ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),
+            ("gain, motion, floater, ghost, dips of beam", alone, "no four views before them at even steps of angle"),
+            ("opposite", self.cones, "cone beam"),
+            ("mass", self.wider, "sample wider than the field"),
+        )
+        return tuple(f"{checks} in {n} of {self.views} views ({why})" for checks, n, why in reasons if n)
+
+
 BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
 SAMPLES = 4  # frames of a kind that tell where the detector saturates
 PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
@@ -36,8 +77,8 @@ POLL = 0.1  # s between looks at a growing file
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What the checks said of a frame, and which frames there are so far.
+class FrameVerdict:
+    """What the checks found in a frame, and the state of the scan up to it.
 
     Attributes:
         row: of the frame, in the file.
@@ -53,7 +94,7 @@ class Judged:
     kind: FrameKind
     flags: tuple[Flag, ...]
     n: int
-    aside: Aside
+    aside: SkippedChecks
     drift: str = ""
     failures: tuple[str, ...] = ()
 
@@ -115,7 +156,7 @@ def replay(
     model: Callable[[float, int], NDArray[np.float32]] | None = None,
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Judged]:
+) -> Iterator[FrameVerdict]:
     """Look at every frame, in the order of the file.
 
     Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
@@ -129,12 +170,12 @@ def replay(
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
+    monitor, aside = start(replace(context_of(source), model=model), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
 
 
 def frames_of(
@@ -167,7 +208,7 @@ def frames_of(
         follow.sleep(POLL)
 
 
-def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> ScanVerdict:
+def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
     """What the checks said of the frames, together with what is wrong with darks, flats and the file.
 
     Args:

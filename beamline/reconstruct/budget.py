@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-import recon
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
-from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.run import binned, run_on
 from recon.assess.plans import Choice, Speeds, plans
 from recon.assess.time_model import duration_text
-from recon.base.binning import bin_views
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
@@ -24,7 +22,7 @@ from recon.base.work import Rates
 from recon.methods import with_settings
 from recon.splatting.initialise import default_count, leaves_the_field
 from recon.splatting.work import speeds_of
-from recon.trials import ROWS, part_of, predicts_best
+from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
 _RESERVE = 0.02  # share of the budget for unmeasured work
@@ -189,7 +187,7 @@ def _chosen(
     at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
     if at is None:
         return plan.preferred(plan.choices()), f"{expected}too little time"
-    return plan.choices(name=liked[at].method)[0], f"residual of views held out, {where}: {residuals}"
+    return plan.choices(name=liked[at].method)[0], f"trials on {where}, {LEFT}: {residuals}"
 
 
 def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
@@ -200,15 +198,10 @@ def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
     """The volume of a method by `end`."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
-    grid, held_out = Grid.matching(geometry), list[int]()
     if isinstance(method, TimedMethod):
         method = method.in_time(data, geometry, seed, lambda: end - now())
-    if method.traits.held_out:
-        data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    use = DataUse(prepared.ray_weights(len(held_out)), held_out)
     trials = control.stop.by(now() + _OF_TRIALS * (end - now()), now)
-    control = replace(control.by(end), stop_trials=trials)
-    return recon.reconstruct(data, geometry, method, grid=grid, seed=seed, use=use, control=control)
+    return run_on(method, prepared, Grid.matching(geometry), seed, replace(control.by(end), stop_trials=trials))
 
 
 def _named(choice: Choice, result: Reconstruction | None = None) -> str:
@@ -216,29 +209,5 @@ def _named(choice: Choice, result: Reconstruction | None = None) -> str:
     if result is not None and result.history:
         text += f", {result.history[-1].step} {choice.counted}"
     if result is not None and choice.is_gaussian_fit:
-        text += f" from {result.settings['gaussians_at_start']} Gaussians"
+        text += f" from {result.started_from} Gaussians"
     return text + (f", binned {choice.binning} x {choice.binning}" if choice.binning > 1 else "")
-
-
-def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
-    """The same views with factor x factor binning: means of line integrals."""
-    if factor == 1:
-        return prepared
-    projections, counted = prepared.projections, prepared.projections.weights
-    data, weights = bin_views(projections.data, factor), None
-    if counted is not None:  # the mean of the rays that are known, each by what it says
-        weights = bin_views(counted, factor)
-        sums = bin_views(counted * projections.data, factor)
-        data = np.divide(sums, weights, out=data, where=weights > 0)
-    held, unseen, measured = prepared.held_out, prepared.held_out_weights, prepared.measured
-    if measured is not None:
-        measured = bin_views(measured[None].astype(np.float32), factor)[0] == 1
-    return replace(
-        prepared,
-        projections=replace(projections, data=data, weights=weights),
-        geometry=prepared.geometry.binned(factor),
-        measured=measured,
-        shares=None if prepared.shares is None else bin_views(prepared.shares, factor),
-        held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
-        held_out_weights=None if unseen is None else bin_views(unseen, factor),
-    )

@@ -4,34 +4,20 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
 
 from beamline.core.errors import DataError
 from beamline.core.need import Need
 from beamline.core.text import count, size
 from beamline.projections.prepare import require_usable
 from beamline.projections.selection import check_axis, cone_of
-from beamline.projections.view_geometry import stated_geometry
-from beamline.reconstruct.error_bars import refuse_views
 from beamline.reconstruct.measure import fit_truth
-from beamline.reconstruct.memory import (
-    memory_of,
-    recon_memory_of,
-    refuse_few_views,
-    refuse_slabs,
-    refuse_smallest,
-    refuse_whole,
-    surely_weighted,
-)
+from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.plan import planned
 from beamline.reconstruct.refusals import refuse_before_reading
-from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.several_scans import SeveralScans, views_of_others, with_as_many_views
+from beamline.reconstruct.several_scans import SeveralScans
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.writers.partial_volume import slabs_of_partial
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
 from recon.base.method import Method, volumes_of
@@ -100,50 +86,35 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     truth = refuse_before_reading(options)
     with options.source.open() as source:
         options = options.around_region(source)
-        geometry = _checked_geometry(source, options, truth)
-        allowed, needs = memory_of(options), recon_memory_of(source, options)
-        shape = Grid.matching(geometry).shape
-        slabs = missing = slabs_of(shape[0], shape[0], 0)
-        fits = needs.at_once <= allowed and options.partial is None
-        if not fits and geometry.is_cone and not options.method.traits.several:
-            raise DataError(
-                f"{source.path}: {options.method.name} would take {size(needs.at_once)}, {size(allowed)} of memory may "
-                "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
-            )
-        if not fits:
-            if options.partial is None:
-                options.target.refuse_partial()
-            refuse_whole(source, options, needs, allowed)
-            needs = replace(needs, weighted=surely_weighted(source, options))
-            refuse_smallest(source, needs, allowed, options.selection.binning)
-            slabs = missing = slabs_of(shape[0], needs.height(allowed), needs.method.traits.halo)
-        if options.partial is not None:
-            slabs, missing = slabs_of_partial(options.partial)
-            if slabs[-1].own.stop != shape[0]:
-                raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {shape[0]}.")
-            refuse_slabs(options.partial, slabs, needs, allowed)
-    output, meanwhile = (needs.volume, 0) if fits else options.disk_needs(needs.volume)
-    scratch = 0 if fits else needs.line_integrals + meanwhile
-    free = _room(options, scratch + output)
-    span = _span(options, needs.method, geometry, missing, rates)
-    done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in missing)
-    height = slabs[0].own.stop
-    of_all = shape if (several := volumes_of(needs.method)) == 1 else (several, *shape)
+        _refuse_scan(source, options)
+        needs = recon_memory_of(source, options)
+        if truth is not None:
+            fit_truth(truth, Grid.matching(needs.geometry), options.selection.binning)
+        plan = planned(source, options, needs)
+    method, geometry = plan.needs.method, plan.needs.geometry
+    options.target.require_room(plan.output, plan.scratch + plan.line_integrals)
+    shape, several = Grid.matching(geometry).shape, volumes_of(method)
+    missing = plan.missing if plan.slabs else slabs_of(shape[0], shape[0], 0)
+    span = _span(options, method, geometry, missing, rates)
     return Estimate(
         method=options.method.name,
         views=geometry.n_views,
-        shape=of_all,
+        shape=shape if several == 1 else (several, *shape),
         at_once=needs.at_once,
-        allowed=allowed,
-        memory=needs.at_once if fits else max(needs.slab(height), needs.least),
+        allowed=plan.allowed,
+        memory=plan.memory,
         slabs=len(missing),
-        done=done,
-        scratch=scratch,
-        output=output,
-        free=free,
+        done=_slices(plan.slabs) - _slices(plan.missing),
+        scratch=plan.scratch + plan.line_integrals,
+        output=plan.output,
+        free=shutil.disk_usage(options.target.output.parent).free,
         seconds=None if span is None else span.most,
         least_seconds=None if span is None else span.least,
     )
+
+
+def _slices(slabs: Sequence[Slab]) -> int:
+    return sum(slab.own.stop - slab.own.start for slab in slabs)
 
 
 def _span(
@@ -163,34 +134,12 @@ def _span(
     return Span(times * span.least, times * span.most)
 
 
-def _checked_geometry(source: ScanSource, options: ReconOptions, truth: NDArray[np.float32] | None) -> Geometry:
-    """The stated geometry of all views. ConfigError and DataError as the reconstruction, before it reads a frame."""
-    scans, selection = options.source, options.selection
+def _refuse_scan(source: ScanSource, options: ReconOptions) -> None:
+    """Raise ConfigError and DataError as the reconstruction, before it reads a frame."""
+    selection = options.selection
     require_usable(source, selection)
-    geometry = stated_geometry(source, selection)
     for axis in (selection.axis_col, source.axis_col if cone_of(source, selection) is None else None):
         if axis is not None:
             check_axis(source, axis)
-    if isinstance(scans, SeveralScans):
-        scans.require_alike(selection)
-    geometry = with_as_many_views(geometry, geometry.n_views + views_of_others(scans, selection))
-    refuse_few_views(source, options, geometry)
-    if isinstance(options.region, Region):
-        locate(options.region, selection, geometry)
-    if options.uncertainty:
-        refuse_views(options.method_for(geometry), geometry)
-    if truth is not None:
-        fit_truth(truth, Grid.matching(geometry), selection.binning)
-    return geometry
-
-
-def _room(options: ReconOptions, needed: int) -> int:
-    """Bytes that the disk of the output has. DataError where that is less than what is needed."""
-    folder = options.target.output.parent
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise DataError(
-            f"{folder} has {size(free)}, and {size(needed)} are needed. Write with -o to another disk, or give --bin "
-            f"{2 * options.selection.binning}."
-        )
-    return free
+    if isinstance(options.source, SeveralScans):
+        options.source.require_alike(selection)

@@ -18,6 +18,7 @@ from recon.base.method import BoundedMethod
 from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.methods import by_name, with_settings
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import first_sweep_seconds
 from recon.splatting.initialise import sweeps_of_start
 
@@ -59,8 +60,8 @@ def fit_within(
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "
             f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method"
         )
-        if (kind := getattr(method, "start", None)) is not None:
-            start = sweeps_of_start(geometry, kind) * sweep
+        if isinstance(method, FitMethod):
+            start = sweeps_of_start(geometry, method.start) * sweep
             sentence += (
                 f". The start of a fit of all pixels takes {duration_text(start)}. With a start from coarse pixels the "
                 f"end is in about {duration_text(least + measuring + after)}"

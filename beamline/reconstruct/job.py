@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
-from beamline.projections.held_out import with_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
@@ -25,14 +23,16 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.progress import compilation_events, progress_events
 from beamline.reconstruct.region import RegionOfRows
+from beamline.reconstruct.run import run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from beamline.reconstruct.workers import cluster
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import (
+    BoundedMethod,
     CheckpointedMethod,
-    DataUse,
+    Ending,
     Method,
     Progress,
     Reconstruction,
@@ -50,7 +50,7 @@ from recon.warm_up import warm_up
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What leads from a reconstruction to its user and back.
+    """Events, warnings, clock and stop requests of one reconstruction.
 
     Attributes:
         stop_scope: opens what asks for an early end, with the volume so far.
@@ -131,27 +131,16 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
             warm_up(candidate, geometry, device=options.device, on_kernel=compiled)
 
 
-def run_on(
-    options: ReconOptions,
-    method: Method,
-    prepared: PreparedProjections,
-    grid: Grid,
-    control: RunControl,
-    reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
-) -> Reconstruction:
-    """Run a method on these views, with some held out if it takes any, until it ends or is stopped."""
-    data, geometry = prepared.projections.data, prepared.geometry
-    held_out: Sequence[int] = ()
-    if method.traits.held_out:
-        data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    # Rays that weigh nothing were filled on disk, as a direct method does it.
-    filled = method.traits.direct and prepared.on_disk
-    weights = None if filled else prepared.ray_weights(len(held_out))
-    with refused(options, f" by {method.name}"):
-        return reconstruct(
-            data, geometry, method, grid=grid, seed=options.seed, device=options.device,
-            use=DataUse(weights, held_out, prepared.emission, prepared.times, prepared.energies), control=control,
-        )  # fmt: skip
+def runner_of(
+    options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
+) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
+    """`run_on` with the seed and the device of the options; what a method refuses names the file."""
+
+    def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
+        with refused(options, f" by {method.name}"):
+            return run_on(method, prepared, grid, options.seed, control, options.device, reconstruct)
+
+    return run
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
@@ -169,23 +158,15 @@ def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPro
     return made, prepared
 
 
-def _recorded(
-    result: Reconstruction, early: bool, chosen: str = "", settings: Mapping[str, Any] | None = None
-) -> Reconstruction:
-    """The result with what the record says of it: what was chosen, by whom, `settings`, and whether it ended early.
-
-    It goes without what only a next run, or a comparison, needs.
-    """
-    ended = {"ended_early": True} if early else {}
-    because = result.settings.get("chosen_because")
-    chosen = chosen or ("" if because is None else f"{result.method}: {because}")
-    settings = {**result.settings, **(settings or {}), **ended}
-    return replace(result, chosen=chosen, settings=settings, checkpoint=None, at=None)
+def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstruction:
+    """The result with how it ended, and what was chosen, without what only a next run, or a comparison, needs."""
+    chosen = chosen or (result.chosen and f"{result.method}: {result.chosen}")
+    return replace(result, chosen=chosen, ending=ending, checkpoint=None, at=None)
 
 
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
     """The volume with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
-    if "ended_early" in made.settings:
+    if made.ending.early:
         job.channels.warn("The error bars were left out, as the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
@@ -227,19 +208,20 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
     control = RunControl(
         job.stop,
-        job.listener(getattr(method, "seconds", None)),
+        job.listener(method.seconds if isinstance(method, BoundedMethod) else None),
         None if checkpoints.path is None else keep,
         resume=resume,
         now=job.channels.clock.now,
         decide=decided if options.uncertainty else None,
     )
-    result = run_on(options, method, prepared, job.grid, control)
+    result = runner_of(options)(method, prepared, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
-    chosen, started_from = "", int(result.settings.get("gaussians_at_start", 0))
-    asked = getattr(method, "gaussians", None) if options.quality is None else None
-    if options.quality is not None:
-        chosen = f"{options.quality}: {getattr(method, 'steps', None)} steps from {started_from} Gaussians"
+    chosen, started_from, asked = "", result.started_from, None
+    if isinstance(method, FitMethod) and options.quality is not None:
+        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
+    elif isinstance(method, FitMethod):
+        asked = method.gaussians
     if isinstance(asked, int) and resume is None and started_from < asked:
         job.channels.warn(
             f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more."
@@ -250,8 +232,8 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
     finishes = method.traits.several or (isinstance(method, FitMethod) and method.finish_sweeps > 0)
     early = job.stop.stopped if finishes else job.stop.cut(reached, planned)
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return _recorded(result, early, chosen, resumed | ({"checkpoint_lost": lost} if lost else {}))
+    resumed_from = "" if checkpoints.resume is None else str(checkpoints.resume)
+    return _ended(result, Ending(early, resumed_from, lost), chosen)
 
 
 def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
@@ -262,11 +244,11 @@ def _by_slabs(job: Job, decided: Decisions) -> Reconstruction:
     with nullcontext() if options.cluster is None else cluster().connected(options.cluster) as connected:
         workers = None
         if connected is not None:
-            workers = SlabWorkers(connected.workers, partial(run_on, options, reconstruct=connected.reconstruct))
+            workers = SlabWorkers(connected.workers, runner_of(options, connected.reconstruct))
         result = in_slabs(
-            partial(run_on, options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
+            runner_of(options), job.prepared, options, job.slabs, control, job.say, job.channels.warn, workers
         )
-    return _recorded(result, job.stop.stopped)
+    return _ended(result, replace(result.ending, early=job.stop.stopped))
 
 
 def _within_budget(job: Job, budget: float) -> tuple[Reconstruction, PreparedProjections]:
@@ -275,4 +257,4 @@ def _within_budget(job: Job, budget: float) -> tuple[Reconstruction, PreparedPro
     control = RunControl(job.stop, job.listener(budget), now=job.channels.clock.now)
     with refused(job.options):
         made, prepared = within(budget, job.prepared, methods, job.options.seed, control, job.channels.warn, largest)
-    return _recorded(made, job.stop.stopped, made.chosen), prepared
+    return _ended(made, Ending(job.stop.stopped), made.chosen), prepared

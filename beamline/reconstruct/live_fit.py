@@ -20,10 +20,11 @@ from beamline.core.errors import DataError
 from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
+from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import PlaceStep, ScanStep
+from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
 from beamline.projections.refusals import checked_views, correction_blockers, refuse
 from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
@@ -311,9 +312,8 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if usable.jumps.size and any(
-            getattr(step, "corrects_jumps", False) for step in in_order(self._options.selection)
-        ):
+        steps = in_order(self._options.selection)
+        if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
@@ -353,6 +353,7 @@ class ScanFollower:
         selection, projections = self._options.selection, self._joined()
         geometry, seen = self.views.geometry(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
+        compare_with_flats(self.source, selection, projections, self._warn, refused=False)
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **seen}
         for step in in_order(selection):

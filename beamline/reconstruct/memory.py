@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import count, size
@@ -16,13 +14,12 @@ from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
-from beamline.projections.selection import choose_views, rows_of
 from beamline.projections.step import StepMemory
+from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.several_scans import views_of_others
+from beamline.reconstruct.several_scans import views_of_others, with_as_many_views
 from beamline.reconstruct.workers import cluster
 from beamline.storage.readers.base import ScanSource
-from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
 from recon.base.slabs import Slab
@@ -49,7 +46,7 @@ class ReconMemory:
     """Bytes that a reconstruction needs.
 
     Attributes:
-        geometry: of the views, binned; before any is read, one that is alike.
+        geometry: of the views, binned, of all scans.
         raw: of the pixels as they are read.
         steps: bytes that the steps of the correction take.
         largest_step: name of the one that takes the most alone.
@@ -63,14 +60,6 @@ class ReconMemory:
     steps: StepMemory = _NO_STEPS
     largest_step: str = ""
     bars: bool = False
-
-    @classmethod
-    def of(
-        cls, method: Method, views: int, shape: tuple[int, int], itemsize: int, axis_col: float | None = None
-    ) -> ReconMemory:
-        """Before any frame is read: of so many views [row, col], bytes of a pixel, and the axis where it is known."""
-        alike = Geometry.parallel(np.linspace(0, math.pi, views, endpoint=False), shape, axis_col=axis_col)
-        return cls(method, alike, views * math.prod(shape) * itemsize, not method.traits.direct)
 
     @property
     def rows(self) -> int:
@@ -159,31 +148,27 @@ def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
 
 
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
-    """The needs of a reconstruction of the chosen views, before any frame is read.
+    """The needs of a reconstruction of the chosen views of all scans, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
+        DataError: the poses do not.
     """
-    selection = options.selection
-    rows, frames = rows_of(source, selection), np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    chosen = choose_views(source, frames, selection).size
-    views = chosen + views_of_others(options.source, selection)
-    shape = (rows.stop - rows.start) // selection.binning, source.shape[1] // selection.binning
-    axis = source.axis_col if selection.axis_col is None else selection.axis_col
-    if axis is not None:
-        axis = (axis - (selection.binning - 1) / 2) / selection.binning
+    selection, method = options.selection, options.method
+    one = stated_geometry(source, selection)
+    geometry = with_as_many_views(one, one.n_views + views_of_others(options.source, selection))
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
     pixel = pixel if source.emission is None else _EMISSION
-    needs = ReconMemory.of(options.method, views, shape, pixel, axis)
-    part = ScanPart(source, selection, needs.geometry)
+    part = ScanPart(source, selection, geometry)
     stated = {step.name: step.memory(part) for step in in_order(selection)}
-    return replace(
-        needs,
-        raw=needs.raw * chosen // max(views, 1),  # a scan at a time
-        method=options.method_for(needs.geometry),
-        steps=StepMemory.of_all(stated.values()),
-        largest_step=max(stated, key=lambda name: stated[name].alone),
-        bars=options.uncertainty,
+    return ReconMemory(
+        options.method_for(geometry),
+        geometry,
+        one.n_views * math.prod(one.detector_shape) * pixel,  # a scan at a time
+        not method.traits.direct,
+        StepMemory.of_all(stated.values()),
+        max(stated, key=lambda name: stated[name].alone),
+        options.uncertainty,
     )
 
 

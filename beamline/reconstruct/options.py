@@ -19,7 +19,7 @@ from beamline.storage.writer_lock import PATIENCE
 from beamline.storage.writers.partial_volume import can_become
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
-from recon.base.method import Method, PresetMethod
+from recon.base.method import EarlyStopMethod, Method, PresetMethod
 from recon.base.settings_check import check_settings
 from recon.methods import has_setting, names, streams
 from recon.splatting.fit_method import StreamingMethod
@@ -59,7 +59,7 @@ class ReconOptions:
         filter: of the FBP that the volume is compared with.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
-        follow: reconstruct a scan while it runs, so; None: it has ended.
+        follow: settings for a scan that is still running; None for one that has ended.
         enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: whose workers reconstruct slabs, see `workers.cluster`; None: this process does.
@@ -121,8 +121,10 @@ class ReconOptions:
         alone = self.region is None and not self.uncertainty
         return alone and self.target.written and can_become(self.target.output)
 
-    def disk_needs(self, volume: int) -> tuple[int, int]:
-        """Bytes on the disk for the result, and for temporary files, of a volume of so many bytes in slabs."""
+    def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
+        """Bytes on the disk for the result, and for temporary files, of a volume of so many bytes."""
+        if not in_slabs:
+            return volume * self.target.written * (1 + self.uncertainty), 0
         compared = self.target.report is not None and not self.method.traits.direct
         slabs = self.partial is None  # else they are there
         bars = self.uncertainty
@@ -163,7 +165,7 @@ class ReconOptions:
     @property
     def stops_early(self) -> bool:
         """Whether the method ends early by views held out."""
-        return getattr(self.method, "early_stop", False)
+        return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
 
     @property
     def streaming(self) -> StreamingMethod:

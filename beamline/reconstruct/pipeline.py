@@ -4,26 +4,234 @@ one that grows."""
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 
-from beamline.core.events import Sink
+from beamline.core.errors import DataError
+from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
-from beamline.reconstruct.finished_views import finished_views
-from beamline.reconstruct.growing_views import growing_views
-from beamline.reconstruct.in_time import warnings_told
-from beamline.reconstruct.job import Channels, volume_of, with_error_bars
+from beamline.core.text import count
+from beamline.projections.held_out import hold_out
+from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.error_bars import refuse_views
+from beamline.reconstruct.in_time import fit_within, warnings_told
+from beamline.reconstruct.job import Channels, Job, compile_kernels, volume_of, with_error_bars
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.measure import fit_truth
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.outcome import ReportContext
+from beamline.reconstruct.options import FollowTiming, ReconOptions
+from beamline.reconstruct.outcome import ReportContext, ScanFacts, facts_of
+from beamline.reconstruct.plan import ReconPlan
+from beamline.reconstruct.progress import compilation_events, corrections_done
 from beamline.reconstruct.refusals import refuse_before_reading
+from beamline.reconstruct.region import Region, locate
+from beamline.reconstruct.remarks import partly_seen_warning
 from beamline.reconstruct.result import write_result
+from beamline.reconstruct.slab_run import keeping
+from beamline.reconstruct.slabs import prepare_within
+from beamline.storage.interrupted import next_step
+from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
+from recon.base.method import BoundedMethod
 from recon.base.stop import Stop
 from recon.base.volume import Grid
+from recon.splatting.r2 import R2
+from recon.warm_up import warm_up
+
+MOST_SECONDS = 600.0  # of the last round
+
+
+@contextmanager
+def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
+    """The job of a scan that runs, or one that has ended, when its last view is there: its fit has learnt all views.
+
+    Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`; where the block fails
+    the newest ones stay, else the picture.
+
+    Raises:
+        DataError: no scan, or one that stopped growing without being finished.
+        KeyboardInterrupt: a stop before there was a volume.
+    """
+    timing, sink, clock = options.follow, channels.sink, channels.clock
+    assert timing is not None
+    with suppress(NotReadyError):
+        options.source.open(follow=True).close()  # what is no scan is refused before anything is compiled
+    _compile(options, channels, timing)
+    with channels.stop_scope() as should_stop:
+        with _open(options, channels, timing) as source:
+            follower = ScanFollower(options, source, sink, clock, channels.warn)
+            if _watch(follower, clock, timing, should_stop):
+                follower.catch_up(should_stop)
+                follower.draw_slices()
+            else:
+                n = follower.n_views_taken
+                channels.warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
+            prepared = follower.prepared()
+
+        def facts() -> ScanFacts:
+            # Opened again: HDF5 may still have the texts of the end as they were when it first read them.
+            picture = options.target.live_picture.name if follower.snapshots.drawn else ""
+            with _open(options, channels, timing) as source:
+                return replace(facts_of(source), live_picture=picture)
+
+        phases = Phases(sink, clock)  # waiting for views does not count as work
+        phases.enter("last round")
+        last_round = follower.last_round(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
+        channels = replace(channels, phases=phases)
+        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), last_round=last_round)
+    follower.snapshots.remove()
+
+
+def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) -> None:
+    """Compile what the fit needs, once on a machine, before the first view. Sweeps on voxels follow the last one.
+
+    The state `ready` then says where the volume can be watched.
+    """
+    sink, clock = channels.sink, channels.clock
+    compiled = compilation_events(sink, clock)
+    sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
+    warm_up(R2(finish=0), on_kernel=compiled)
+    picture = options.target.live_picture
+    message = (
+        f"The live volume is ready for views. To watch it grow, open {picture}: slices from the eighth "
+        f"view on, and the volume, drawn anew about every {timing.snapshot:g} s"
+    )
+    sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
+
+
+def _open(options: ReconOptions, channels: Channels, timing: FollowTiming) -> ScanSource:
+    """Wait until the file exists and is readable."""
+    sink, clock = channels.sink, channels.clock
+    begin = clock.now()
+    told = False
+    while True:
+        try:
+            return options.source.open(follow=True)
+        except NotReadyError as error:
+            if clock.now() - begin > timing.patience:
+                raise DataError(f"No scan began in {options.source.path} within {timing.patience:.0f} s.") from error
+            if not told:
+                sink(StateEntered("waiting", f"Waiting for {options.source.path}", time=clock.now()))
+                told = True
+            clock.sleep(timing.poll)
+
+
+def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_stop: Callable[[], bool]) -> bool:
+    """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
+
+    Raises:
+        DataError: the scan died. KeyboardInterrupt: a stop, before there were views enough.
+    """
+    last_snapshot = clock.now()
+    writer = WriterWatch(follower.source.path, last_snapshot, timing.patience)
+    while True:
+        ended = follower.source.finished  # asked before the frames, so that none is missed
+        grew = follower.take_new_frames(ended)
+        if ended:
+            return True
+        if should_stop() and not follower.source.finished:
+            if not follower.has_volume:
+                raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
+            return False
+        if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
+            raise DataError(
+                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
+                f"and with --unfinished the {follower.views.n} views that are there are used."
+            )
+        follower.draw_slices(timing.picture)
+        if not follower.advance(timing.slice):
+            clock.sleep(timing.poll)
+        elif clock.now() - last_snapshot >= timing.snapshot:
+            follower.write_snapshot()
+            last_snapshot = clock.now()
+        follower.ask_whether_enough()
+
+
+_HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
+
+
+@contextmanager
+def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
+    """The job of a scan whose views are all there, with compiled kernels; slabs stay where the block fails.
+
+    Raises:
+        ConfigError, DataError: the views, the memory or the disk do not suffice.
+    """
+    sink, clock, warn, phases = channels.sink, channels.clock, channels.warn, channels.phases
+    phases.enter("opening the scan")
+    with options.source.open() as source:
+        facts, options = facts_of(source), options.around_region(source)
+        box = options.region if isinstance(options.region, Region) else None
+        if box is not None and box.reason:
+            sink(StateEntered("roi", box.reason, time=clock.now()))
+        prepared, plan = prepare_within(source, options, sink, clock, warn, phases)
+    prepared = _for_method(options, prepared, plan, channels)
+    _announce(options, prepared, channels)
+    if few := partly_seen_warning(prepared.geometry):
+        warn(few)
+    region = None if box is None else locate(box, options.selection, prepared.geometry)
+    # A direct method and a slab have no volume so far: a signal interrupts them.
+    stopping = never_stopped if options.method.traits.direct or plan.slabs else channels.stop_scope
+    with keeping(options.partial_path) if plan.slabs else nullcontext():
+        phases.enter("compiling kernels")
+        compile_kernels(options, prepared.geometry, sink, clock)
+        phases.enter("reconstruction")
+        before_report = Stop()
+        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
+            started = channels.started, channels.worked
+            method, before_report = fit_within(options.method, prepared, options.target, started, clock, warn)
+            options = replace(options, method=method)
+        yield Job(
+            options,
+            channels,
+            prepared,
+            lambda: facts,
+            stopping,
+            slabs=plan.slabs,
+            region=region,
+            leaves=before_report.leaves,
+        )
+
+
+def _for_method(
+    options: ReconOptions, prepared: PreparedProjections, plan: ReconPlan, channels: Channels
+) -> PreparedProjections:
+    """The views as the method takes them, with some held out where it ends early, after their disk was looked at.
+
+    Raises:
+        ConfigError, DataError: the views do not suffice, or the disk does not.
+    """
+    if options.uncertainty:
+        refuse_views(options.method_for(prepared.geometry), prepared.geometry)
+    if options.cluster is not None and not plan.slabs:
+        channels.warn(
+            "The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs."
+        )
+    if options.stops_early and prepared.held_out is None:
+        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
+        n = prepared.projections.view_ids.size
+        message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
+        channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
+    options.target.require_room(plan.output, plan.scratch)
+    return prepared
+
+
+def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Channels) -> None:
+    """Report the requested corrections of the views, then send the event `recon_started`."""
+    sink, clock = channels.sink, channels.clock
+    corrections_done({name: done.sentence for name, done in prepared.done.items() if not done.warned}, sink, clock)
+    views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
+    more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
+    sink(
+        ReconStarted(
+            options.source.path, options.method.name, views.n_views, prepared.axis_col, more=more, time=clock.now()
+        )
+    )
 
 
 def reconstruct_file(

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.projections.selection import check_axis
 from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.options import ReconOptions
@@ -20,10 +21,13 @@ from recon.splatting.backend import backend_for
 
 
 def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
-    """Raise ConfigError and DataError for what shows before a frame is read.
+    """Check all that can be checked without reading a frame.
 
     Returns:
         The truth [z, y, x] that the volume is to be compared with; None without one.
+
+    Raises:
+        ConfigError, DataError: a check failed; nothing was written.
     """
     if options.follow is not None:
         _refuse_unfollowed(options)
@@ -47,6 +51,8 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
         for each in scans_of(options.source):
             with each.open() as source:
                 _require_finished(source, options)
+                if options.selection.axis_col is not None:
+                    check_axis(source, options.selection.axis_col)
     return truth
 
 

@@ -131,7 +131,7 @@ def odd_views_warning(
     So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
     `progress` hears how many of how many views were compared.
     """
-    if by_name(made.method).traits.direct or made.settings.get("ended_early"):
+    if by_name(made.method).traits.direct or made.ending.early:
         return ""
     views = prepared.projections.data
     found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), progress=progress)

@@ -19,21 +19,40 @@ from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
-from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.outcome import ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
-from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile
+from beamline.storage.recon_record import ReconRecord, Value, VoxelsInFile, recorded_ending
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.partial_volume import complete
 from drivers.base.clock import Clock
+from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Volume
 from recon.methods import BASELINE
 from recon.prep.align import AxisEstimate
+from recon.splatting.gaussians import Gaussians
+
+
+def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
+    """The arrays of a model for a file, by name: physical values, so that no other program needs our parameters."""
+    return {
+        "kernel": gaussians.kernel.value,
+        "density_unit": gaussians.density_unit,
+        **gaussians.physical(),
+        "view_angles": geometry.angles,
+        "view_shifts": geometry.shifts,
+        "view_roll": geometry.roll,
+        "view_tilt": geometry.tilt,
+        **({"view_centres": geometry.centres} if geometry.centres.any() else {}),
+        "detector_shape": np.array(geometry.detector_shape),
+        "pixel_pitch": geometry.pixel_pitch,
+        "axis": np.array([geometry.axis_col, geometry.axis_row]),
+        "source_distances": np.array([geometry.sod, geometry.sdd]),
+    }
 
 
 def write_result(
@@ -59,22 +78,21 @@ def write_result(
     phases = context.phases
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
-    elapsed = clock.now() - context.started
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
-    context = replace(context, warnings=remarks, stray=judged.stray_map, elapsed=elapsed)
+    context = replace(context, warnings=remarks, stray=judged.stray_map)
     phases.enter("report")
     record, volumes = _record(judged, context, clock.now())
-    page: Path | None = None
+    page, timed = None, _nothing
     try:
         if target.report is not None:
             from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
-            from beamline.report.html import write_report
+            from beamline.report.html import write_report, write_timed
 
             metrics, parameters = judged.metrics, record.parameters
             report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
-            page = target.report
+            page, timed = target.report, partial(write_timed, target.report, report, label_of(made.method))
         phases.enter("writing the volume")
         if partial_volume is not None:
             complete(partial_volume, record, target.output, replace=target.replace)
@@ -86,9 +104,14 @@ def write_result(
         raise
     phases.end()
     elapsed = clock.now() - context.started
+    timed(elapsed)
     record = _light(replace(record, elapsed=elapsed, times=phases.seconds), target)  # to replace it reads its voxels
     sink(VolumeDone(record, time=clock.now()))
     return record
+
+
+def _nothing(elapsed: float) -> None:
+    """There is no page that states the time."""
 
 
 def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
@@ -159,7 +182,7 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
 
 
 def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
-    """The record without what its files hold, or, where none is written, with no more than its volumes."""
+    """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:
         at = None if target.names or series is None else 0
@@ -232,6 +255,7 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "filter": context.filter,
         "seed": context.seed,
         **_flat("", made.settings),
+        **recorded_ending(made.ending),
         **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
         **({"recipe": context.recipe} if context.recipe else {}),

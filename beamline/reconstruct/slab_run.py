@@ -24,7 +24,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions
-from recon.base.method import Method, Progress, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.methods.fista_tv import FistaTv
@@ -260,6 +260,7 @@ def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
         "decided": decide.made,
         "method": first.method,
         "settings": dict(first.settings),
+        "chosen": first.chosen,
         "history": [astuple(progress) for progress in first.history],
     }
 
@@ -268,10 +269,11 @@ def _whole(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: f
     """The result, when all slabs are there."""
     kept = partial.kept
     settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.traits.halo}
-    if options.partial is not None:
-        settings["resumed_from"] = str(options.partial)
     history = tuple(Progress(*values) for values in kept["history"])
-    return Reconstruction(Volume(partial.volume, grid), settings, history, method=kept["method"], seconds=seconds)
+    return Reconstruction(
+        Volume(partial.volume, grid), settings, history, method=kept["method"], seconds=seconds, chosen=kept["chosen"],
+        ending=Ending(resumed_from="" if options.partial is None else str(options.partial)),
+    )  # fmt: skip
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
@@ -293,7 +295,7 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
 
     def watch(progress: Progress) -> None:
         nonlocal reached
-        share = progress.step / progress.steps if progress.steps else 0.0
+        share = 0.0 if progress.unit == SWEEPS_OF_TRIALS or not progress.steps else progress.step / progress.steps
         at = done + round((slab.own.stop - slab.own.start) * share)
         reached = max(reached, at)  # a fit's finish counts from the beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))

@@ -21,12 +21,13 @@ from beamline.plan.angles import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, new_figure, png, round_length
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
+from recon.base.greys import matter_window
 from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
@@ -150,13 +151,11 @@ class PictureRow:
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
     """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
-    from matplotlib.figure import Figure
-
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
     headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
     width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+    figure = new_figure((width / _DPI, height / _DPI), _DPI, False)
     top = height
     for row, pixels in zip(rows, tall, strict=True):
         if row.heading:
@@ -197,7 +196,7 @@ def _slice_panels(
     images: Sequence[F32], at: Sequence[float], pixel: float, unit: str, unseen: Wedge | None = None
 ) -> list[_Panel]:
     """Slices across z, y and x at these places, in the same greys."""
-    window = grey_window(images)
+    window = matter_window(*images)
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
     notes = (grey, "the same greys and scale", "the same greys and scale")

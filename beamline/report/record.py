@@ -79,7 +79,7 @@ def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
     also for other rates than those of the fits that were measured, as after following a scan.
     """
     judged, settings = residual_curve(history_arrays(made.history)), made.settings
-    if judged is None or views_grew(made) or "resumed_from" in settings:
+    if judged is None or views_grew(made) or made.ending.resumed_from:
         return None
     if "pace" in settings:  # of a fit
         usual, steps = FitSettings(), made.history[-1].step

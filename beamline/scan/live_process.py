@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from beamline.config.load import Config, plan_of
 from beamline.core.events import (
@@ -154,7 +154,7 @@ class LiveReconstruction:
         with self._changing:
             self._start("x")
 
-    def _start(self, mode: str) -> None:
+    def _start(self, mode: Literal["a", "x"]) -> None:
         try:
             with self._log.open(mode, encoding="utf-8") as stderr:
                 self._process = ChildProcess(

@@ -18,6 +18,7 @@ from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
+from beamline.core.plausible import doubt, doubt_span
 from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
@@ -105,6 +106,21 @@ class DryRun:
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
             ],
         }
+
+
+def doubts(config: Config) -> list[str]:
+    """Sentences on values of a configuration that no instrument has, as of a mistaken unit; empty: there is none."""
+    optics, scan = config.optics, config.scan
+    energies = (optics.energy_kev, scan.energy, *(scan.energies or ()))
+    exposures = (scan.exposure_s, scan.darks.exposure_s, scan.flats.exposure_s)
+    sentences = [
+        doubt("pixel_size_um", optics.pixel_size_um),
+        doubt("distance_mm", optics.distance_mm),
+        *(doubt("energy_kev", energy) for energy in energies),
+        *(doubt("exposure_s", exposure) for exposure in exposures),
+        doubt_span(getattr(scan.angles, "span_deg", None)),
+    ]
+    return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 
 
 def dry_run(

@@ -8,7 +8,9 @@ import math
 import os
 import re
 import stat
+import struct
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -20,11 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import leads_away, same_file
+from beamline.core.files import is_link, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
-from beamline.storage.journal import pending
-from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
@@ -73,8 +73,6 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
-    if (changes := pending(path)) is not None:
-        return h5py.File(Overlay(path, changes.ranges), "r")
     problems, is_held = [], False
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
@@ -108,8 +106,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
     if missing:
         raise DataError(
-            f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
-            "original. Where its disk did not take them, `beamline recover` keeps its frames. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If the disk "
+            "was full, `beamline recover` rescues its frames. Nothing was read."
         )
     if being_written:
         raise DataError(
@@ -159,7 +157,7 @@ def opened_itself(path: Path) -> Iterator[None]:
         for number, file in _open_by_name().items() if os.name == "posix" else ():
             if number not in by_name and os.fsdecode(file.name) == str(path):
                 opened.append(os.fstat(file.get_vfd_handle()))
-        itself = stat.S_ISREG(here.st_mode) and not leads_away(path) and all(same_file(here, each) for each in opened)
+        itself = stat.S_ISREG(here.st_mode) and not is_link(path) and all(same_file(here, each) for each in opened)
     except (OSError, ValueError):  # it is gone, or was closed
         itself = False
     if not itself:
@@ -201,8 +199,12 @@ def is_hdf5(path: Path, follow: bool = False) -> bool:
     return False
 
 
-ALTERED = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, OverflowError, MemoryError)
-"""What h5py and numpy raise where a file is damaged, or holds other things than its names promise."""
+ALTERED = (
+    *(OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
+    *(EOFError, MemoryError, struct.error, zlib.error),
+)
+"""What libraries raise where a file is damaged, or holds other things than its names promise; none of ours is among
+them."""
 
 
 @contextmanager
@@ -507,7 +509,8 @@ def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
     for source in item.virtual_sources():
         if source.file_name == ".":
             drawn = dataset(item.file, source.dset_name)
-            if drawn is None or drawn.shape[1:] != source.src_space.shape[1:]:
+            whole = not source.src_space.shape
+            if drawn is None or not (_fills(drawn, source) if whole else drawn.shape[1:] == source.src_space.shape[1:]):
                 lost.add(source.dset_name)
         elif not _is_there(folder / source.file_name, source, within):
             lost.add(str(folder / source.file_name))
@@ -528,9 +531,19 @@ def _is_there(path: Path, source: Any, within: int) -> bool:
 
 def _holds(drawn: h5py.Dataset, source: Any) -> bool:
     space = source.src_space
-    if not space.shape:  # all of it, whatever its shape is
-        return int(drawn.size) == source.vspace.get_select_npoints() and drawn.shape[1:] == source.vspace.shape[1:]
+    if not space.shape:
+        return _fills(drawn, source)
     return drawn.shape[1:] == space.shape[1:] and space.get_select_bounds()[1][0] < drawn.shape[0]
+
+
+def _fills(drawn: h5py.Dataset, source: Any) -> bool:
+    """Whether all of a dataset has the shape of its place: some frames, or a stripe or tile of each."""
+    place = source.vspace
+    extent = place.shape
+    if place.get_select_type() == h5py.h5s.SEL_HYPERSLABS and place.is_regular_hyperslab():
+        _, _, counts, blocks = place.get_regular_hyperslab()
+        extent = tuple(n * block for n, block in zip(counts, blocks, strict=True))
+    return [n for n in drawn.shape if n != 1] == [n for n in extent if n != 1]
 
 
 def require_possible(item: h5py.Dataset) -> None:

@@ -1,33 +1,49 @@
-"""Overlay: a file for HDF5 whose writes stay in memory; the disk does not change."""
+"""Overlay: a file for HDF5 whose writes stay in memory until all of them are carried out.
+
+What lies beyond the present end of the file is written first, so that a full disk is found while the file is as it was:
+overwriting bytes takes no room. Then the file is marked as being written, the bytes that differ are written, and the
+head comes last. Whatever stops this leaves a file whose blocks are the old or the new ones, all of them with what they
+refer to: readers take it for one of a writer that died, and `recover` ends it.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import shutil
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+from beamline.core.errors import DataError
+from beamline.core.files import to_disk
+from beamline.core.text import size
 from beamline.storage.disk_file import UnderHdf5
-from beamline.storage.journal import FileChange, FileChanges
-from beamline.storage.torn import made_whole
+from beamline.storage.superblock import SIZE, Superblock, made_whole
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 
 
+class PartlyChangedError(DataError):
+    """The disk refused when the file had been changed in part."""
+
+
 class Overlay(UnderHdf5):
-    """Bytes of a file, covered by later writes in memory, for h5py.File(overlay).
+    """Bytes of a file, covered by later writes in memory, for h5py.File(overlay). Torn blocks are made whole.
 
     Args:
-        changes: bytes that replace the file's.
         length: of the file in bytes; bytes beyond its end are zero.
     """
 
-    def __init__(self, path: Path, changes: Sequence[FileChange] = (), length: int = 0) -> None:
+    def __init__(self, path: Path, length: int = 0) -> None:
         super().__init__(path, "r", length)
         self._there = os.fstat(self._file.fileno()).st_size
         self._pages: dict[int, bytearray] = {}
-        for change in changes:
-            self.put(change.at, change.new)
+
+    def copy(self) -> Self:
+        """The same file with the same writes; later ones are its own."""
+        made = type(self)(self.path, self._size)
+        made._pages = {page: bytearray(data) for page, data in self._pages.items()}
+        return made
 
     def _read(self, at: int, out: memoryview) -> None:
         self._from_disk(at, out)
@@ -37,6 +53,8 @@ class Overlay(UnderHdf5):
                 begin = page * _PAGE
                 first, last = max(at, begin), min(end, begin + _PAGE)
                 out[first - at : last - at] = self._pages[page][first - begin : last - begin]
+        if (mended := made_whole(at, out)) is not None:
+            self.put(*mended)
 
     def write(self, data: Any) -> int:
         given = bytes(data)
@@ -58,18 +76,80 @@ class Overlay(UnderHdf5):
         self._size = self._at if length is None else length
         return self._size
 
-    def changes(self) -> FileChanges:
-        """Written bytes that differ from the disk's; the file never becomes shorter."""
-        ranges = []
+    @property
+    def head(self) -> Superblock:
+        """The head of the file with the writes."""
+        self.seek(0)
+        return Superblock(self.read(SIZE), self._there)
+
+    @property
+    def room(self) -> int:
+        """Bytes that the file takes beyond those that it has; it never becomes shorter."""
+        return max(0, self._size - self._there)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the writes differ from what is on the disk."""
+        return bool(self.room or self._differing())
+
+    def carry_out(self) -> None:
+        """Change the file.
+
+        Raises:
+            DataError: its disk has no room or does not take it; the file is as it was.
+            PartlyChangedError: the disk failed later.
+        """
+        if not self.changed:
+            return
+        if (free := shutil.disk_usage(self.path.parent).free) < self.room:
+            raise DataError(
+                f"{self.path} needs {size(self.room)} on its disk to be changed, {size(free)} are free. Nothing was "
+                "changed."
+            )
+        longer = False
+        try:
+            with self.path.open("r+b", buffering=0) as file:
+                for page in sorted(self._pages):
+                    begin = max(page * _PAGE, self._there)
+                    _put(file, begin, self._pages[page][begin - page * _PAGE : max(0, self._size - page * _PAGE)])
+                if self.room:
+                    file.truncate(self._size)
+                to_disk(file.fileno())
+                longer = True
+                self._change(file)
+        except OSError as error:
+            why = error.strerror or str(error)
+            if longer:
+                raise PartlyChangedError(
+                    f"{self.path} is changed in part only: its disk does not take the rest ({why}). Its frames are "
+                    "there. Mend the disk, then run `beamline recover` on it."
+                ) from error
+            with suppress(OSError):
+                os.truncate(self.path, self._there)
+            raise DataError(f"{self.path} cannot be made longer ({why}). What was in it is as it was.") from error
+
+    def _change(self, file: Any) -> None:
+        before = Superblock(bytes(self._on_disk(0)[:SIZE]), self._there)
+        after, last = self.head.head, self._differing()
+        if not before.open_for_writing:
+            _put(file, 0, before.marked().head)
+            to_disk(file.fileno())
+        for at, data in last:
+            skipped = max(0, SIZE - at)
+            _put(file, at + skipped, data[skipped:])
+        to_disk(file.fileno())
+        _put(file, 0, after)
+        to_disk(file.fileno())
+
+    def _differing(self) -> list[tuple[int, bytes]]:
+        """Bytes, within the present length of the file, that differ from the disk's, page by page."""
+        differing = []
         for page in sorted(self._pages):
             begin, old, new = page * _PAGE, self._on_disk(page), self._pages[page]
-            there = min(max(self._there - begin, 0), _PAGE)  # of this page; the file has nothing after it
-            stop = min(max(self._size - begin, there), _PAGE)
-            differ = [i for i in range(stop) if i >= there or old[i] != new[i]]
-            if differ:
-                first, last = differ[0], differ[-1] + 1
-                ranges.append(FileChange(begin + first, bytes(old[first : min(last, there)]), bytes(new[first:last])))
-        return FileChanges(self.path, max(self._there, self._size), tuple(ranges))
+            at = [i for i in range(min(_PAGE, self._there - begin)) if old[i] != new[i]]
+            if at:
+                differing.append((begin + at[0], bytes(new[at[0] : at[-1] + 1])))
+        return differing
 
     def _on_disk(self, page: int) -> bytearray:
         out = bytearray(_PAGE)
@@ -77,14 +157,11 @@ class Overlay(UnderHdf5):
         return out
 
 
-class WholeBlocks(Overlay):
-    """An overlay that makes torn blocks whole."""
-
-    def _read(self, at: int, out: memoryview) -> None:
-        super()._read(at, out)
-        if (mended := made_whole(at, out)) is not None:
-            self.put(*mended)
-
-
 def _pages(begin: int, end: int) -> range:
     return range(begin // _PAGE, -(-end // _PAGE))
+
+
+def _put(file: Any, at: int, data: bytes | bytearray) -> None:
+    file.seek(at)
+    while data:
+        data = data[file.write(data) :]

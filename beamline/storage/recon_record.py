@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from beamline.core.voxel_kind import VoxelKind
 from recon.assess.time_model import NextDecibel
+from recon.base.method import Ending
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Value = str | int | float | bool | NDArray[Any]
 _MOVE = ("x", "y", "z", "turn", "image", "magnification")  # of a sample between two scans
-_ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # parameters that tell how it ended
+_ENDS = {"ended_early": "early", "resumed_from": "resumed_from", "checkpoint_lost": "lost_checkpoint"}
+"""Parameters that tell how it ended, and fields of `Ending`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ class ReconRecord:
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
         series: all volumes, where `volume` is one of several; None: it is the only one.
         kind: what the voxels are.
-        model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
+        model: the Gaussians behind the volume and the geometry of their views (`result.arrays_of_model`); empty: none.
         compared: metrics of FBP of the same views; None without. This and what follows are of a volume that was made
             by this program just now; files do not hold it.
         warnings: sentences.
@@ -118,12 +120,12 @@ class ReconRecord:
 
     @property
     def unit(self) -> str:
-        """Of the voxels; empty for shares."""
+        """Unit of the voxels; empty for shares."""
         return self.kind.unit(self.length_unit)
 
     @property
     def method(self) -> str:
-        """Its name; of a choice, that of the method chosen. Empty in the file of another program."""
+        """Name of the method; with `auto`, of the one that it chose. Empty in a file of another program."""
         return str(self.parameters.get("method", ""))
 
     @property
@@ -132,9 +134,15 @@ class ReconRecord:
         return float(self.parameters.get("axis_col", math.nan))
 
     @property
+    def ending(self) -> Ending:
+        """How it ended, as its parameters say."""
+        early, *others = (self.parameters.get(name, "") for name in _ENDS)
+        return Ending(bool(early), *map(str, others))
+
+    @property
     def ended_early(self) -> bool:
         """It was stopped, and is the volume reached by then."""
-        return bool(self.parameters.get("ended_early", False))
+        return self.ending.early
 
     @property
     def seconds_of_volumes(self) -> tuple[float, ...]:
@@ -172,8 +180,6 @@ class ReconRecord:
 
     def event_values(self) -> dict[str, Any]:
         """What the event `done` says of it, by name, in the order of its line."""
-        parameters = self.parameters
-        ends = {name: parameters[name] for name in _ENDS if name in parameters}
         others = {
             "outputs": self.outputs or None,
             "displacements": self.displacements or None,
@@ -189,12 +195,17 @@ class ReconRecord:
             "report": self.report,
             "method": self.method,
             "axis_col": self.axis_col,
-            "n_views": parameters.get("n_views"),
+            "n_views": self.parameters.get("n_views"),
             "shape": self.grid.shape if self.series is None else self.series.data.shape,
             "units": self.unit,
             "elapsed": self.elapsed,
             "times": self.times,
             **self.metrics,
-            **ends,
+            **recorded_ending(self.ending),
             **{name: value for name, value in others.items() if value is not None},
         }
+
+
+def recorded_ending(ending: Ending) -> dict[str, Value]:
+    """The parameters that tell how a reconstruction ended; none of one that began anew and came to its end."""
+    return {name: value for name, field in _ENDS.items() if (value := getattr(ending, field))}

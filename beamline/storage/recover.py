@@ -1,7 +1,7 @@
 """recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept.
 
-HDF5 mends the file in memory, and the result is read. Only then the few bytes that differ are written, by a journal.
-Whatever stops it, it can be run again.
+HDF5 mends the file in memory, and the result is read. Only then the few bytes that differ are written (see
+storage.overlay). Whatever stops it, it can be run again. So a file of 30 GB needs a few kB of its disk and no copy.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ from beamline.core.errors import DataError
 from beamline.core.files import refuse_existing, same_file, whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
-from beamline.storage import hdf5, journal
-from beamline.storage.journal import FileChanges
-from beamline.storage.overlay import Overlay, WholeBlocks
+from beamline.storage import hdf5
+from beamline.storage.overlay import Overlay, PartlyChangedError
 from beamline.storage.parts import copy_rows, gaps_in, require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
-from beamline.storage.superblock import SIZE, Superblock, superblock
+from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, ending_in, state_ending, state_words
@@ -98,7 +97,6 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
     with suppress(OSError):  # a file that nobody can write to may be in order
         lock = WriterLock(path, exclusive=True)
     try:
-        begun = journal.finish(path)
         head = _checked(path)
         if head.open_for_writing or head.missing or not _finished(path):
             try:
@@ -106,7 +104,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             except DataError as error:
                 return _rescued(path, head, error, say)
         else:
-            done, mended = _as_it_is(path, begun), FileChanges(path, head.size, ())
+            done, mended = _as_it_is(path), Overlay(path)
         return _with_view(done, mended, say)
     finally:
         if lock is not None:
@@ -131,36 +129,31 @@ def _finished(path: Path) -> bool:
         return bool(file[layout.FINISHED][()])
 
 
-def _as_it_is(path: Path, changed: bool) -> Recovered:
+def _as_it_is(path: Path) -> Recovered:
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
         require_joined(file)
-        frames, missing = int(file[layout.COMMITTED][()]), _views_missing(file) if changed else None
-        return Recovered(path, changed, frames, 0, missing, altered=_altered(file, frames))
+        frames = int(file[layout.COMMITTED][()])
+        return Recovered(path, False, frames, 0, None, altered=_altered(file, frames))
 
 
-def _with_view(done: Recovered, mended: FileChanges, say: Callable[[str], None]) -> Recovered:
+def _with_view(done: Recovered, mended: Overlay, say: Callable[[str], None]) -> Recovered:
     """Carry it out with the /exchange view; without it where the disk takes only that."""
-    with hdf5.readable(done.path), h5py.File(Overlay(done.path, mended.ranges), "r") as file:
-        if has_exchange_view(file):
-            _announce(mended, say)
-            mended.carry_out()
-            return done
+    with hdf5.readable(done.path), h5py.File(mended, "r") as file:
+        complete = has_exchange_view(file)
     try:
-        whole = with_exchange_view(done.path, mended.ranges)
-        _announce(whole, say)
+        whole = mended if complete else with_exchange_view(mended)
+        if whole.changed:
+            free = size(shutil.disk_usage(done.path.parent).free)
+            say(f"{done.path}: to recover it takes {size(whole.room)} on its disk, {free} are free.")
         whole.carry_out()
+    except PartlyChangedError:
+        raise
     except DataError as error:
-        if journal.pending(done.path) is not None:
+        if complete:
             raise
         mended.carry_out()
         return replace(done, remark=f"It has no /exchange view: {error}")
-    return replace(done, changed=True)
-
-
-def _announce(changes: FileChanges, say: Callable[[str], None]) -> None:
-    if changes.ranges:
-        free = shutil.disk_usage(changes.path.parent).free
-        say(f"{changes.path}: to recover it takes {size(changes.room)} on its disk, {size(free)} are free.")
+    return done if complete else replace(done, changed=True)
 
 
 def _now_beside(path: Path) -> float:
@@ -175,10 +168,10 @@ def _require_ours(path: Path, file: h5py.File) -> None:
         raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
 
-def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
-    """The recovered file, and the changes that make it."""
+def _mended(path: Path, head: Superblock) -> tuple[Recovered, Overlay]:
+    """The recovered file, and the writes that make it."""
     end = max(head.end, head.size) if head.open_for_writing else head.end
-    overlay = WholeBlocks(path, length=end)
+    overlay = Overlay(path, end)
     overlay.put(0, head.closed(end).head)
     try:
         with h5py.File(overlay, "r") as file:
@@ -188,11 +181,10 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
         with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
             committed, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
             frames = _cut(path, file, committed, head)
-        overlay.seek(0)
-        made = replace(head, head=overlay.read(SIZE))
-        if made.missing and (
-            head.missing or frames < committed
-        ):  # all that is left lies before, or the next lines would not read it
+        # Where bytes are missing, all that is left lies before, or the next lines would not read it. Elsewhere HDF5
+        # must add nothing before the end, in the room of rows that were cut off.
+        made = overlay.head
+        if made.end < head.size or head.missing or frames < committed:
             overlay.put(0, made.closed(head.size).head)
             overlay.truncate(head.size)
         with h5py.File(overlay, "r") as file:
@@ -205,7 +197,7 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
         raise DataError(
             f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
         ) from error
-    return done, overlay.changes()
+    return done, overlay
 
 
 def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str], None]) -> Recovered:
@@ -217,7 +209,7 @@ def _rescued(path: Path, head: Superblock, damage: DataError, say: Callable[[str
     Raises:
         DataError: `damage`, where no frame can be read; or the disk does not take the new file. Nothing is changed.
     """
-    overlay = WholeBlocks(path, length=max(head.end, head.size))
+    overlay = Overlay(path, max(head.end, head.size))
     new, kept = path.with_name(f"{path.name}.recovered"), path.with_name(f"{path.name}.damaged")
     overlay.put(0, head.closed(max(head.end, head.size)).head)
     try:
@@ -303,12 +295,9 @@ def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
     """End the file as a writer does, with the frames that are committed and on the disk; how many these are."""
     growing = (layout.DATA, layout.PREVIEW, *layout.GROWING)
     frames = min(committed, *(_rows_within(file[name], head.size) for name in growing))
-    for name in growing:
-        if len(file[name]) != frames:
-            file[name].resize(frames, 0)
-    file[layout.COMMITTED][()], file[layout.FINISHED][()] = frames, 1
+    file[layout.COMMITTED][()] = frames
     ending = ending_in(file)
-    if ending.status == RUNNING:
+    if ending.status == RUNNING or ending.reason == DIED:  # which a recovery that was stopped may have stated in part
         ending = ScanEnding("failed", gaps_in(path, file), DIED)
     if frames < committed:
         lost = f"Frames {spans(range(frames, committed))} were written and are not on the disk."
@@ -317,11 +306,15 @@ def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
         state_words(file, ending)
     elif ending != ending_in(file):
         state_ending(file, ending)
+    for name in growing:  # after what takes room, which HDF5 would put where these were
+        if len(file[name]) != frames:
+            file[name].resize(frames, 0)
     times = file[layout.TIME][()]
     if layout.END_TIME in file and not file[layout.END_TIME][()] and np.isfinite(times).any():
         file[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
     if layout.FIELD_OF_VIEW in file:
         layout.state_field_of_view(file)
+    file[layout.FINISHED][()] = 1
     return frames
 
 

@@ -238,6 +238,13 @@ def _from_hdf5(path: Path, file: h5py.File, name: str | None) -> NDArray[np.gene
 def _only(path: Path, axes: dict[str, int]) -> str:
     volumes = [name for name, n in axes.items() if n == 3]
     if len(volumes) != 1:
+        from beamline.storage.readers.open import scan_format  # here: what reads a volume needs no reader of scans
+
+        if (scan := scan_format(path)) is not None:
+            raise DataError(
+                f"{path} is a scan ({scan}), not a volume: `beamline recon {path}` makes a volume of it. To look at "
+                f"one of its arrays, name it in `view` as FILE::NAME ({', '.join(volumes) or 'none'})."
+            )
         raise DataError(
             f"{path} holds {len(volumes)} volumes ({', '.join(volumes) or 'none'}); name one as its dataset, in `view` "
             "as FILE::NAME."

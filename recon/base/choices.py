@@ -20,7 +20,5 @@ KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 
 NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
 
-N_GAUSSIANS, SIDE = 50_000, 256  # Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view
-
 FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""

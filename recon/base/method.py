@@ -56,6 +56,10 @@ class Progress:
     unit: str = ""
 
 
+SWEEPS_OF_TRIALS = "sweeps of trials"
+"""`Progress.unit` of trials, whose planned number is that of most scans: a search goes on as long as it must."""
+
+
 @dataclass(frozen=True, eq=False)
 class Energies:
     """The energies of views, and what pure materials attenuate there.
@@ -160,6 +164,21 @@ class ReconProblem:
     device: str
 
 
+@dataclass(frozen=True)
+class Ending:
+    """How a reconstruction ended, and from where it went on.
+
+    Attributes:
+        early: it was stopped, and has the volume reached by then.
+        resumed_from: file of an earlier run that it continued; empty: it began anew.
+        lost_checkpoint: why the last checkpoint could not be written; empty: none was lost.
+    """
+
+    early: bool = False
+    resumed_from: str = ""
+    lost_checkpoint: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """A reconstructed volume, with what its method says of itself: what `Method.run` and `recon.reconstruct` return.
@@ -178,6 +197,8 @@ class Reconstruction:
         at: gives the volume [z, y, x] that a view shows, by its time as in `DataUse.times`, or by the number of its
             energy; None: the method makes one volume.
         chosen: how a choice, a budget or a preset came to the settings; empty where they were given.
+        started_from: Gaussians at the start of a fit; 0 for other methods.
+        ending: how it ended, as its caller knows it.
     """
 
     volume: Volume
@@ -191,6 +212,8 @@ class Reconstruction:
     series: VolumeSeries | None = None
     at: Callable[[float], F32] | None = None
     chosen: str = ""
+    started_from: int = 0
+    ending: Ending = Ending()
 
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
@@ -211,9 +234,6 @@ class Reconstruction:
         """
         settings = {name: value for name, value in self.settings.items() if not isinstance(value, np.ndarray)}
         self.volume.save(path, method=self.method, seconds=self.seconds, settings=json.dumps(settings, default=str))
-
-
-MethodResult = Reconstruction  # under this name methods of other packages know it
 
 
 @dataclass(frozen=True)
@@ -338,6 +358,33 @@ class BoundedMethod(Method, Protocol):
 
 
 @runtime_checkable
+class EarlyStopMethod(Protocol):
+    """A method that views held out may end early."""
+
+    @property
+    def early_stop(self) -> bool:
+        """They do."""
+
+
+@runtime_checkable
+class SignedMethod(Protocol):
+    """A method with a setting for voxels below 0."""
+
+    @property
+    def allow_negative(self) -> bool:
+        """It keeps them."""
+
+
+@runtime_checkable
+class ListedMethods(Protocol):
+    """A method that chooses among others."""
+
+    @property
+    def candidates(self) -> tuple[Method, ...]:
+        """By preference."""
+
+
+@runtime_checkable
 class CheckpointedMethod(Method, Protocol):
     """A method with the trait `checkpoints`."""
 
@@ -362,4 +409,4 @@ def volume_names_of(method: Any) -> tuple[str, ...]:
 
 def candidates_of(method: Method) -> tuple[Method, ...]:
     """The methods that it chooses among, by preference; only itself if it does not choose."""
-    return getattr(method, "candidates", (method,))
+    return method.candidates if isinstance(method, ListedMethods) else (method,)

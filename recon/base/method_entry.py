@@ -7,6 +7,22 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
+class Lengths:
+    """Lengths of a method that a comparison tries.
+
+    Attributes:
+        setting: "iterations" or "steps".
+        quick, full: of a short and of a long comparison. The first one is the baseline, about which others vary.
+        chosen: the data choose a length by default, which is the baseline.
+    """
+
+    setting: Literal["iterations", "steps"]
+    quick: tuple[int, ...]
+    full: tuple[int, ...]
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
 class MethodEntry:
     """Where a method is.
 
@@ -16,6 +32,7 @@ class MethodEntry:
         compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
         emission: it is compared where the sample emits, whatever `compared` says.
         several: what its volumes are of, where it makes several.
+        lengths: that a trade-off tries; None: the default.
     """
 
     module: str
@@ -24,3 +41,4 @@ class MethodEntry:
     compared: bool = True
     emission: bool = False
     several: Literal["", "times", "materials"] = ""
+    lengths: Lengths | None = None

@@ -9,29 +9,32 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 
-from recon.compiled.archive import archive_of, unpack
+from recon.compiled.archive import ROOT
 from recon.compiled.level import ProcessorLevel, level_for, processor_flags
 
-ROOT = Path(__file__).parents[2]
-"""The folder of the packages `beamline`, `recon` and `simulators`."""
+LOCATORS = (
+    "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,recon.compiled.cache.UnwritableFolder,"
+    "IPythonCacheLocator,ZipCacheLocator"
+)
+"""Where numba keeps what it compiles, the first that can be written: its own places, and one that need not be."""
 
 
 def use_compiled_kernels() -> None:
-    """Sets the level for numba and for processes begun from here on, and unpacks the compiled kernels once.
+    """Sets the cache and the level for numba, and for processes begun from here on.
 
     The user's own settings of numba stand: of the processor, of the cache, of no compilation. Where numba is imported
-    already, it may have compiled for this very processor, and nothing is changed.
+    already, it may have compiled for this very processor, and only the cache is set.
     """
-    if "numba" in sys.modules or "NUMBA_DISABLE_JIT" in os.environ:
+    if "NUMBA_DISABLE_JIT" in os.environ:
         return
+    if (numba := sys.modules.get("numba")) is not None:
+        numba.config.CACHE_LOCATOR_CLASSES = numba.config.CACHE_LOCATOR_CLASSES or LOCATORS
+        return
+    os.environ.setdefault("NUMBA_CACHE_LOCATOR_CLASSES", LOCATORS)
     level = level_for(os.environ, processor_flags())
-    if level is None:
-        return
-    os.environ |= level.environment
-    if "NUMBA_CACHE_DIR" not in os.environ and "NUMBA_CACHE_LOCATOR_CLASSES" not in os.environ:
-        unpack(archive_of(sys.version_info[:2]), ROOT)
+    if level is not None:
+        os.environ |= level.environment
 
 
 __all__ = ["ROOT", "ProcessorLevel", "use_compiled_kernels"]

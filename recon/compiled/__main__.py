@@ -16,12 +16,13 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from recon.compiled import ROOT
-from recon.compiled.archive import archive_of, digest, member, read_sources, write_archive
+from recon.compiled.archive import archive_of, digest, fresh_members, member, read_sources, unsealed, write_archive
 from recon.compiled.level import LEVELS
 
 PACKAGES = ("beamline", "recon", "simulators")
@@ -41,7 +42,9 @@ def main() -> int:
         if done.returncode:
             return done.returncode
     archive = archive_of(sys.version_info[:2])
-    members = {module: files for module in _modules(ROOT) if (files := _packed(module))}
+    carried = {} if not archive.is_file() else {name: member(archive, name) for name in fresh_members(archive, ROOT)}
+    known = sorted({*carried, *_modules(ROOT)})
+    members = {module: files for module in known if (files := _packed(module, carried.get(module, {})))}
     write_archive(archive, members, ROOT)
     sys.stdout.write(f"{archive}: {len(members)} modules, {archive.stat().st_size / 1e6:.2f} MB\n")
     return 0
@@ -80,9 +83,14 @@ def _modules(root: Path) -> list[str]:
     return sorted(modules)
 
 
-def _indices(module: str, root: Path) -> list[Path]:
+def _compiled_here(module: str, root: Path) -> dict[str, bytes]:
+    """What numba has compiled for the kernels of a module and keeps beside it, by name."""
     source = root.joinpath(*module.split("."))
-    return sorted((source.parent / "__pycache__").glob(f"{source.name}.*.{_tag()}.nbi"))
+    found = {}
+    for path in (source.parent / "__pycache__").glob(f"{source.name}.*.{_tag()}.*nb[ic]"):
+        with suppress(OSError, ValueError):  # damaged
+            found[path.name] = unsealed(path.read_bytes())
+    return found
 
 
 def _tag() -> str:
@@ -92,18 +100,9 @@ def _tag() -> str:
 def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     """Types that kernels were compiled for, by module and name."""
     archive, signatures = archive_of(sys.version_info[:2]), defaultdict[tuple[str, str], set[Any]](set)
-    packed: list[tuple[str, str, bytes]] = []
-    if archive.is_file():
-        packed += (
-            (module, name, content)
-            for module in read_sources(archive)
-            for name, content in member(archive, module).items()
-            if name.endswith(".nbi")
-        )
-    for root in roots:
-        packed += (
-            (module, path.name, path.read_bytes()) for module in _modules(root) for path in _indices(module, root)
-        )
+    members = [(name, member(archive, name)) for name in (read_sources(archive) if archive.is_file() else ())]
+    members += [(name, _compiled_here(name, root)) for root in roots for name in _modules(root)]
+    packed = [(module, *each) for module, files in members for each in files.items() if each[0].endswith(".nbi")]
     for module, name, content in packed:
         try:
             importlib.import_module(module)  # its types
@@ -127,29 +126,32 @@ def _read(content: bytes) -> tuple[Any, Index]:
     return stamp, index
 
 
-def _packed(module: str) -> dict[str, bytes]:
-    """The cache's files for the kernels of a module: what was compiled for a level, from the source as it is now."""
+def _packed(module: str, carried: Mapping[str, bytes]) -> dict[str, bytes]:
+    """The cache's files for the kernels of a module: what was compiled for a level, from the source as it is now.
+
+    Args:
+        carried: those in the archive that are still right; their bytes stay where nothing was added.
+    """
     from numba import __version__
     from numba.core.serialize import dumps
 
     importlib.import_module(module)
-    source, files = str(digest(ROOT.joinpath(*module.split(".")).with_suffix(".py"))), dict[str, bytes]()
+    source, files = str(digest(ROOT.joinpath(*module.split(".")).with_suffix(".py"))), dict(carried)
     processors = {(level.name, level.features) for level in LEVELS}
-    for path in _indices(module, ROOT):
-        stamp, index = _read(path.read_bytes())
+    here = _compiled_here(module, ROOT)
+    for name, content in here.items():
+        stamp, index = _read(content) if name.endswith(".nbi") else (None, {})
         if stamp is None or stamp.hex() != source:
             continue
-        renamed = {}
-        for key, name in index.items():
-            if tuple(key[1][1:]) in processors and (path.parent / name).is_file():
-                content = (path.parent / name).read_bytes()
-                renamed[key] = f"{path.stem}.{hashlib.sha256(content).hexdigest()[:16]}.nbc"
-                files[renamed[key]] = content
-        if renamed == index:
-            files[path.name] = path.read_bytes()
-        elif renamed:
+        known = _read(carried[name])[1] if name in carried else {}
+        renamed = dict(known)
+        for key, code in index.items():
+            if key not in known and tuple(key[1][1:]) in processors and code in here:
+                renamed[key] = f"{name[:-4]}.{hashlib.sha256(here[code]).hexdigest()[:16]}.nbc"
+                files[renamed[key]] = here[code]
+        if renamed != known:
             ordered = dict(sorted(renamed.items(), key=lambda item: item[1]))
-            files[path.name] = pickle.dumps(__version__, -1) + dumps((stamp, ordered))
+            files[name] = pickle.dumps(__version__, -1) + dumps((stamp, ordered))
     return files
 
 

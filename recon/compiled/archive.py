@@ -1,4 +1,4 @@
-"""The archive of compiled kernels: a zip with one member a module, made once and unpacked where numba looks for them.
+"""The archive of compiled kernels: a zip with one member a module, which is read where it lies.
 
 A member holds the files of numba's cache for the kernels of a module (indices, `.nbi`, and object code, `.nbc`), as a
 tar compressed by xz. `sources.json` says which source files its kernels were compiled from: the module and all that it
@@ -6,8 +6,7 @@ imports of this project, since numba copies functions and constants of other mod
 they change. A member whose sources differ stays packed, so that those kernels are compiled anew.
 
 numba's files are pickles, which can run any code when they are loaded. The archive is part of the package and as
-trustworthy as its modules; it is unpacked into `__pycache__` beside these, where numba and Python keep theirs, and
-nowhere that is not as well protected.
+trustworthy as its modules. Checksums of zip and xz tell damage.
 """
 
 from __future__ import annotations
@@ -19,18 +18,23 @@ import io
 import json
 import lzma
 import struct
+import sys
 import tarfile
-import uuid
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 
+ROOT = Path(__file__).parents[2]
+"""The folder of the packages `beamline`, `recon` and `simulators`."""
 SOURCES = "sources.json"
 _DAMAGE = (
     *(OSError, ValueError, KeyError, EOFError, RuntimeError, OverflowError, struct.error),
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, tarfile.TarError),
 )
+_MARK = b"sha256:"  # before the digest at the end of a file, which pickle does not read
+_SEAL = len(_MARK) + hashlib.sha256().digest_size
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the same files make the same archive
 
 
@@ -39,28 +43,21 @@ def archive_of(python: tuple[int, int]) -> Path:
     return Path(__file__).with_name("py{}{}.zip".format(*python))
 
 
-def unpack(archive: Path, root: Path) -> None:
-    """Unpacks the members whose sources under `root` are the archive's, once: a mark says that it was done.
-
-    An archive that is damaged or absent, or a folder that cannot be written, leaves numba to compile. A file is whole
-    when it gets its name, and object code has its name by its content, so several processes may unpack at once.
-    """
+@lru_cache(maxsize=8)
+def carried(source: bytes) -> Mapping[str, bytes]:
+    """The files of numba's cache for the module whose source has this digest; none where nothing whole is carried."""
+    archive = archive_of(sys.version_info[:2])
     with contextlib.suppress(*_DAMAGE):
-        stat = archive.stat()
-        mark, state = archive.parent / "__pycache__" / f"{archive.stem}.unpacked", f"{stat.st_size} {stat.st_mtime_ns}"
-        if mark.is_file() and mark.read_text(encoding="ascii") == state:
-            return
-        with contextlib.suppress(*_DAMAGE):
-            _unpack(archive, root)
-        _write(mark, state.encode("ascii"))
+        module = _carried_modules(archive).get(source.hex())
+        return {} if module is None else member(archive, module)
+    return {}
 
 
-def _unpack(archive: Path, root: Path) -> None:
-    for module in fresh_members(archive, root):
-        folder = root.joinpath(*module.split(".")).parent / "__pycache__"
-        files = member(archive, module)
-        for name in sorted(files, key=lambda name: name.endswith(".nbi")):  # an index after what it names
-            _write(folder / name, files[name])
+@lru_cache
+def _carried_modules(archive: Path) -> dict[str, str]:
+    """Modules whose kernels can be used, by the digest of their source."""
+    sources = read_sources(archive)
+    return {sources[module][_path(module)]: module for module in fresh_members(archive, ROOT)}
 
 
 def fresh_members(archive: Path, root: Path) -> Iterator[str]:
@@ -132,8 +129,12 @@ def source_files(module: str, root: Path) -> list[str]:
     return sorted(paths)
 
 
+def _path(module: str) -> str:
+    return "/".join(module.split(".")) + ".py"
+
+
 def _file(module: str, root: Path) -> str | None:
-    path = "/".join(module.split(".")) + ".py"
+    path = _path(module)
     return path if (root / path).is_file() else None
 
 
@@ -146,11 +147,15 @@ def _imported(path: Path) -> Iterable[str]:
             yield from (f"{statement.module}.{name.name}" for name in statement.names)
 
 
-def _write(path: Path, content: bytes) -> None:
-    path.parent.mkdir(exist_ok=True)
-    new = path.with_name(f"{path.name[:32]}.{uuid.uuid4().hex}.tmp")
-    try:
-        new.write_bytes(content)
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
+def sealed(content: bytes) -> bytes:
+    """The content of a file with its digest at the end."""
+    return content + _MARK + hashlib.sha256(content).digest()
+
+
+def unsealed(content: bytes) -> bytes:
+    """The content of a file without its digest, if it has one. ValueError where that is of something else."""
+    if not content[-_SEAL:].startswith(_MARK):
+        return content
+    if sealed(content[:-_SEAL]) != content:
+        raise ValueError("the content differs from its digest")
+    return content[:-_SEAL]

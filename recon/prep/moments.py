@@ -14,6 +14,7 @@ _ORDERS = 4  # of moments that tell angles: those above follow edges, rings and 
 _BANDS = 16  # of rows, whose moments are taken
 _MATTER = 0.2  # of the fullest row, or of the densest column: with less, moments are mostly noise
 _RIM = 0.05  # of the densest column: below it there is air
+_KNOTS, _VIEWS_A_KNOT, _LEAST_KNOTS, _ROUNDS = 12, 6, 4, 3  # of the errors of angles along a scan
 _LEAST_ROWS = 8  # fewer have no profile along the axis; each half of the rows has one, too
 _ROUNDING = 1e-6  # of a band's mass: what float32 line integrals do to a moment, and a little more
 _UPSIDE_DOWN = 16.0  # squared distance to the first view's profile over that to the same profile turned over
@@ -30,6 +31,8 @@ class ViewMoments:
         down: float64 [view], by how many rows the matter is lower than in the mean view.
         flipped: bool [view], views whose rows are those of the first view from the last to the first.
         stretch: the angle by which the views turned, over the one stated, less 1.
+        turned: float64 [view], rad by which each view is turned beside its angle, less the mean; 0 where few tell.
+        turned_left: the variance that moments have beside the laws at these angles, over that at those stated.
     """
 
     axis_col: float
@@ -42,6 +45,9 @@ class ViewMoments:
     flipped: NDArray[np.bool_]
     stretch: float
     stretch_sigma: float
+    turned: F64
+    turned_sigma: float
+    turned_left: float
 
 
 def moments_of(views: Iterable[F32], angles: NDArray[np.floating], axis_col: float) -> ViewMoments:
@@ -65,10 +71,10 @@ def moments_of(views: Iterable[F32], angles: NDArray[np.floating], axis_col: flo
     of_views = mass.sum(axis=1)
     middle = float(np.median(of_views))
     of_views = of_views / middle - 1 if middle > 0 else np.full_like(of_views, np.nan)
-    flipped = _upside_down(mass)
     return ViewMoments(
-        axis, axis_sigma, across, across_sigma, of_views, down, down_sigma, flipped, stretch, stretch_sigma
-    )
+        axis, axis_sigma, across, across_sigma, of_views, down, down_sigma, _upside_down(mass), stretch, stretch_sigma,
+        *_turned(bands, turned, axis_col),
+    )  # fmt: skip
 
 
 def _sums(views: Iterable[F32]) -> tuple[F64, F64]:
@@ -138,6 +144,66 @@ def _centres(bands: F64, angles: F64) -> tuple[float, float, F64, float]:
     return float(shares[0] @ weight), axis_sigma, across, float(np.sqrt(np.median(alone)))
 
 
+@dataclass(frozen=True, eq=False)
+class _Orders:
+    """Moments of orders 1 to 4 of bands of rows, by Chebyshev's polynomials about an axis.
+
+    Attributes:
+        moments: [view, band] of each order.
+        of_axis: their change for a column of the axis, likewise.
+        rounding: [band], least variance.
+    """
+
+    moments: list[F64]
+    of_axis: list[F64]
+    rounding: F64
+
+    @classmethod
+    def of(cls, bands: F64, axis_col: float) -> _Orders:
+        across = np.arange(bands.shape[2]) - axis_col
+        profile = np.abs(bands).mean(axis=(0, 1))
+        radius = np.abs(across[profile > _RIM * profile.max()]).max() + 1.0
+        inside = np.abs(across) <= radius
+        seen, places, quarter = bands[:, :, inside], across[inside] / (radius + 0.5), 0.25 / (radius + 0.5)
+        moments, of_axis = [], []
+        for order in range(1, _ORDERS + 1):
+            moments.append(seen @ _chebyshev(order, places))
+            of_axis.append(2 * (seen @ (_chebyshev(order, places + quarter) - _chebyshev(order, places - quarter))))
+        return cls(moments, of_axis, (_ROUNDING * np.abs(seen).sum(axis=2).mean(axis=0)) ** 2)
+
+    def errors(self, angles: F64, basis: F64, every: int) -> tuple[F64, F64, float]:
+        """Errors of the angles as shares of a basis [view, share], their standard deviations, and the variance that the
+        moments have beside the polynomials of these angles, as a sum over orders and bands of shares of their own.
+
+        Args:
+            every: 2 for the multiples of the angle of the order's parity, 1 for all.
+        """
+        n, bands = basis.shape[1] + 1, self.rounding.size
+        normal, right, variances = np.zeros((bands, n, n)), np.zeros((bands, n)), 0.0
+        for order, (moment, of_column) in enumerate(zip(self.moments, self.of_axis, strict=True), 1):
+            multiples = np.arange(order % every, order + 1, every)[:, None]
+            cosines, sines = np.cos(multiples * angles), np.sin(multiples * angles)
+            turning = multiples[:, 0] > 0
+            parts = np.concatenate([cosines, sines[turning]]).T
+            change = np.concatenate([-multiples * sines, (multiples * cosines)[turning]]).T
+            shares = np.linalg.lstsq(parts, moment, rcond=None)[0]
+            effects = np.concatenate([basis.T[:, :, None] * (change @ shares), of_column[None]])
+            effects -= np.stack([parts @ np.linalg.lstsq(parts, each, rcond=None)[0] for each in effects])
+            rest = moment - parts @ shares
+            variance = np.maximum((rest**2).sum(axis=0) / (len(angles) - parts.shape[1]), self.rounding)
+            normal += np.einsum("avb,cvb,b->bac", effects, effects, 1 / variance)
+            right += np.einsum("avb,vb,b->ba", effects, rest, 1 / variance)
+            variances += float(variance.sum() / max(float((moment**2).mean(axis=0).sum()), 1e-30))
+        total, of_all = normal.sum(axis=0), right.sum(axis=0)
+        if np.linalg.matrix_rank(total) < n:
+            return np.full(n - 1, np.nan), np.full(n - 1, np.nan), variances
+        found, sigma = np.linalg.solve(total, of_all)[:-1], np.sqrt(np.diag(np.linalg.inv(total))[:-1])
+        if bands > 2:  # without each of the bands in turn, which disagree where the sample moves
+            without = np.linalg.solve(total - normal, (of_all - right)[..., None])[:, :-1, 0]
+            sigma = np.maximum(sigma, np.sqrt((bands - 1) * without.var(axis=0)))
+        return found, sigma, variances
+
+
 def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
     """By how much more than stated the views turned, and its standard deviation.
 
@@ -147,52 +213,35 @@ def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
     """
     if len(angles) <= 2 * _ORDERS + 1 or not bands.size:
         return np.nan, np.nan
-    across = np.arange(bands.shape[2]) - axis_col
-    profile = np.abs(bands).mean(axis=(0, 1))
-    radius = np.abs(across[profile > _RIM * profile.max()]).max() + 1.0
-    inside = np.abs(across) <= radius
-    seen, places, quarter = bands[:, :, inside], across[inside] / (radius + 0.5), 0.25 / (radius + 0.5)
-    moments, of_axis = [], []
-    for order in range(1, _ORDERS + 1):
-        moments.append(seen @ _chebyshev(order, places))
-        of_axis.append(2 * (seen @ (_chebyshev(order, places + quarter) - _chebyshev(order, places - quarter))))
-    rounding = (_ROUNDING * np.abs(seen).sum(axis=2).mean(axis=0)) ** 2
-    stretch, sigma = _scale(moments, of_axis, angles, rounding, 2)
-    other, other_sigma = _scale(moments, of_axis, angles, rounding, 1)
-    return stretch, max(sigma, other_sigma, abs(stretch - other))
+    orders, basis = _Orders.of(bands, axis_col), (angles - angles.mean())[:, None]
+    (stretch,), (sigma,), _ = orders.errors(angles, basis, 2)
+    (other,), (other_sigma,), _ = orders.errors(angles, basis, 1)
+    return float(stretch), float(max(sigma, other_sigma, abs(stretch - other)))
 
 
-def _scale(moments: list[F64], of_axis: list[F64], angles: F64, rounding: F64, every: int) -> tuple[float, float]:
-    """The factor of the angles less 1, by moments [view, band] of each order, and its standard deviation.
+def _turned(bands: F64, angles: F64, axis_col: float) -> tuple[F64, float, float]:
+    """By how much each view is turned beside its angle, the standard deviation, and the variance that the moments have
+    at these angles, over that at those stated.
 
-    Args:
-        of_axis: change of the moments for a column of the axis, likewise.
-        rounding: [band], least variance.
-        every: 2 for the multiples of the angle of the order's parity, 1 for all.
+    The errors are a line from knot to knot of the scan. All views turned alike are the same sample.
     """
-    step = angles - angles.mean()
-    normal, right = np.zeros((rounding.size, 2, 2)), np.zeros((rounding.size, 2))
-    for order, (moment, of_column) in enumerate(zip(moments, of_axis, strict=True), 1):
-        multiples = np.arange(order % every, order + 1, every)[:, None]
-        cosines, sines = np.cos(multiples * angles), np.sin(multiples * angles)
-        turning = multiples[:, 0] > 0
-        parts = np.concatenate([cosines, sines[turning]]).T
-        change = np.concatenate([-multiples * sines, (multiples * cosines)[turning]]).T
-        shares = np.linalg.lstsq(parts, moment, rcond=None)[0]
-        both = np.stack([step[:, None] * (change @ shares), of_column])
-        both -= np.stack([parts @ np.linalg.lstsq(parts, each, rcond=None)[0] for each in both])
-        rest = moment - parts @ shares
-        variance = np.maximum((rest**2).sum(axis=0) / (len(angles) - parts.shape[1]), rounding)
-        normal += np.einsum("avb,cvb,b->bac", both, both, 1 / variance)
-        right += np.einsum("avb,vb,b->ba", both, rest, 1 / variance)
-    total, of_all = normal.sum(axis=0), right.sum(axis=0)
-    if np.linalg.matrix_rank(total) < 2:
-        return np.nan, np.nan
-    stretch, sigma = np.linalg.solve(total, of_all)[0], np.linalg.inv(total)[0, 0] ** 0.5
-    if (n := len(right)) > 2:  # without each of the bands in turn, which disagree where the sample moves
-        without = np.linalg.solve(total - normal, (of_all - right)[..., None])[:, 0, 0]
-        sigma = max(sigma, np.sqrt((n - 1) * without.var()))
-    return float(stretch), float(sigma)
+    knots, n = min(_KNOTS, len(angles) // _VIEWS_A_KNOT), len(angles)
+    turned = np.zeros(n)
+    if knots < _LEAST_KNOTS or not bands.size:
+        return turned, np.nan, 1.0
+    orders = _Orders.of(bands, axis_col)
+    at = np.linspace(0, n - 1, knots)
+    basis = np.stack([np.interp(np.arange(n), at, knot) for knot in np.eye(knots)[1:]], axis=1)
+    basis -= basis.mean(axis=0)
+    sigma, before = np.full(knots - 1, np.nan), np.nan
+    for _ in range(_ROUNDS):
+        found, sigma, variances = orders.errors(angles + turned, basis, 2)
+        before = variances if np.isnan(before) else before
+        if not np.isfinite(found).all():
+            return np.zeros(n), np.nan, 1.0
+        turned = turned + basis @ found
+    after = orders.errors(angles + turned, basis, 2)[2]
+    return turned, float(np.median(sigma)), after / before
 
 
 def _chebyshev(order: int, places: F64) -> F64:

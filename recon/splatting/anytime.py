@@ -12,7 +12,7 @@ import math
 from dataclasses import fields, replace
 
 from recon.splatting.density_control import DensityPolicy
-from recon.splatting.optimise import FitState
+from recon.splatting.optimise import FitState, settle
 from recon.splatting.settings import FitSettings
 
 HALF = 60.0  # steps after which the rates are half of the first ones
@@ -51,6 +51,7 @@ def average(state: FitState, since: int) -> None:
     """
     if state.step % _EVERY:
         return
+    settle(state)
     if state.mean is None:
         state.mean = {name: values + 0 for name, values in state.parameters.items()}
         return
@@ -60,5 +61,5 @@ def average(state: FitState, since: int) -> None:
 
 
 def averaged(state: FitState) -> FitState:
-    """The state with the mean in place of its parameters, if a mean is kept; it shares their memory."""
+    """The state with its parameters replaced by their running mean, if it has one; nothing is copied."""
     return state if state.mean is None else replace(state, parameters=state.mean)

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import Any, Protocol, SupportsFloat, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
@@ -22,6 +23,7 @@ from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.adam import adam_all, add_lengths
 from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
 from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
+from recon.kernels.fused_step import FusedStep, StepModel, StepPlan
 
 Array = TypeVar("Array")
 
@@ -113,6 +115,21 @@ class Backend(Protocol[Array]):
     ) -> None:
         """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
 
+    def unit_quaternions(self, quaternions: Array, first: Array, second: Array) -> None:
+        """Quaternions [n, 4] of length 1 that turn as before, with Adam's moments in their measure, in place.
+
+        Quaternions without a direction stay as they are.
+        """
+
+    def taken(self, array: Array, origin: NDArray[np.int64]) -> Array:
+        """The rows `origin` of an array, zeros for -1."""
+
+    def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> FusedStep | None:
+        """Whole steps without the host in between; None where the step is made operation by operation.
+
+        `earlier`: those of the fit before, of another model or plan.
+        """
+
 
 def backend_for(device: str) -> Backend[Any]:
     """The backend for "cpu", or for "cuda", the current CUDA device ("cuda:0" where that is its number).
@@ -152,6 +169,19 @@ class Cpu:
         self, means: F32, log_scales: F32, quaternions: F32, raw: F32, unit: float, kernel: Kernel = Kernel.GAUSSIAN
     ) -> CpuPass:
         return CpuPass(self, Active.of(means, log_scales, quaternions, raw, unit, kernel), quaternions, raw, unit)
+
+    def unit_quaternions(self, quaternions: F32, first: F32, second: F32) -> None:
+        length = np.linalg.norm(quaternions.astype(np.float64), axis=1, keepdims=True)
+        length[length < 1e-12] = 1
+        quaternions[:], first[:], second[:] = quaternions / length, first * length, second * length**2
+
+    def taken(self, array: F32, origin: NDArray[np.int64]) -> F32:
+        rows = array[origin]
+        rows[origin < 0] = 0
+        return rows
+
+    def fused_step(self, model: StepModel, plan: StepPlan, earlier: FusedStep | None) -> None:
+        return None
 
     def scratch(self, n: int, detector_shape: tuple[int, int]) -> Scratch:
         """Scratch buffers for a view of n Gaussians; the last ones are reused if they fit."""

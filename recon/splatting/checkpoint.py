@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recon.base.kernel import Kernel
 from recon.splatting.backend import Backend, Cpu
-from recon.splatting.optimise import FitState
+from recon.splatting.optimise import FitState, settle
 from recon.splatting.settings import NAMES
 
 _COUNTS = ("limit", "step", "seen")
@@ -25,6 +25,7 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
     Raises:
         ValueError: for a random generator other than numpy's default, PCG64.
     """
+    settle(state)
     device = backend or Cpu()
     arrays: dict[str, NDArray[Any]] = {"statistic": device.numpy(state.statistic)}
     for group in ("parameters", "first", "second"):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.engine import Active
+from recon.kernels.fused_step import FusedStep, StepInputs, StepModel, StepPlan
 from recon.splatting.backend import Backend, Cpu, Pass
 from recon.splatting.density_control import DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
@@ -30,7 +31,8 @@ class FitState:
     """All that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
 
     `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels. They live on the
-    backend's device. `mean` is a running mean of the parameters, or None, see `anytime`.
+    backend's device. `mean` is a running mean of the parameters, or None, see `anytime`. Where `fused` makes the steps,
+    the arrays may be some steps behind until `settle`.
     """
 
     parameters: dict[str, Any]
@@ -47,6 +49,7 @@ class FitState:
     loss: Any = float("nan")
     residual: Any = float("nan")
     mean: dict[str, Any] | None = None
+    fused: FusedStep | None = None
 
     @property
     def n(self) -> int:
@@ -108,35 +111,137 @@ def step(
         fraction: how far the schedule has come, 0..1; sets the learning rates and the window of density control.
         view: the first view to take; None draws it, as the others, without replacement.
     """
+    views = [
+        _draw(state, problem.geometry.n_views) if view is None or k else view for k in range(settings.views_per_step)
+    ]
+    weight = tv_weight(settings, problem, state.limit)
+    box = _RandomBox.of(state, problem.grid, tv_size(settings, problem.grid)) if weight > 0 else None
+    state.step += 1
+    update = _Update.of(state, problem, settings, fraction)
+    fused = _fused(state, problem, settings, update, box)
+    if fused is None:
+        _by_operations(state, problem, settings, views, box, weight, update)
+    else:
+        images, maps, weights = (
+            [arrays[k] for k in views] for arrays in (problem.images, problem.target_maps, problem.weights)
+        )
+        corner, of_variation = (0.0, 0.0, 0.0) if box is None else box.first(problem.grid), weight * problem.half_field
+        fused.run(
+            StepInputs(problem.geometry, views, images, maps, weights, corner, of_variation, update.rates, state.step)
+        )
+        state.loss, state.residual = fused.loss, fused.residual
+    state.seen += len(views)
+    if state.step % NORMALISE == 0:
+        _normalise_quaternions(state, problem.backend)
+    policy = settings.policy
+    if policy is not None and state.step % policy.every == 0 and policy.start <= fraction < policy.stop:
+        _grow(state, problem, policy)
+    return state
+
+
+class _RandomBox(NamedTuple):
+    """The voxels on which a step's total variation acts: the first one (z, y, x), and their number along each axis.
+
+    A step takes no `Grid` of its own, whose checks take as long as a GPU takes for the step.
+    """
+
+    corner: tuple[int, ...]
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, state: FitState, grid: Grid, side: int) -> _RandomBox:
+        z, y, x = (min(side, n) for n in grid.shape)
+        corner = tuple(int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, (z, y, x), strict=True))
+        return cls(corner, (z, y, x))
+
+    def first(self, grid: Grid) -> tuple[float, float, float]:
+        """The centre (z, y, x) of its first voxel, mm."""
+        z, y, x = (f + c * edge for f, c, edge in zip(grid.first, self.corner, grid.spacing, strict=True))
+        return z, y, x
+
+    def grid(self, grid: Grid) -> Grid:
+        return grid.part(*(slice(c, c + n) for c, n in zip(self.corner, self.shape, strict=True)))
+
+
+@dataclass(frozen=True)
+class _Update:
+    """Rates and bounds of the four parameters in one step."""
+
+    rates: tuple[float, ...]
+    bounds: tuple[tuple[float, float] | None, ...]
+
+    @classmethod
+    def of(cls, state: FitState, problem: FitProblem, settings: FitSettings, fraction: float) -> _Update:
+        shrink = settings.pace * settings.decay**fraction
+        rates = tuple(
+            rate * shrink * (problem.half_field if name == "means" else 1.0)
+            for name, rate in zip(NAMES, settings.rates, strict=True)
+        )
+        smallest = settings.smallest * problem.geometry.sample_pitch
+        widths = (float(np.log(smallest)), float(np.log(problem.half_field)))
+        return cls(rates, (None, widths, None, None))
+
+
+def _fused(
+    state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
+) -> FusedStep | None:
+    """What makes whole steps of this state on the device, kept from step to step while nothing changes its plan."""
+    shape, before = None if box is None else box.shape, state.fused
+    key = (
+        problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
+        settings.tv_moves, update.bounds, shape, any(weights is not None for weights in problem.weights),
+    )  # fmt: skip
+    raw = state.parameters[NAMES[-1]]
+    if before is not None and before.plan.key == key and before.model.parameters[-1] is raw:
+        return before
+    settle(state)
+    cut, small = settings.truncation, None if box is None else replace(box.grid(problem.grid), centre=(0.0, 0.0, 0.0))
+    plan = StepPlan(
+        key, problem.geometry, state.kernel, settings.rays, 1 / problem.half_field, cut.faint, cut.sigmas,
+        settings.views_per_step, problem.loss, key[-1], small, cut.faint / problem.half_field, settings.tv_moves,
+        update.bounds,
+    )  # fmt: skip
+    parameters, first, second = (
+        tuple(arrays[name] for name in NAMES) for arrays in (state.parameters, state.first, state.second)
+    )
+    model = StepModel(parameters, first, second, state.statistic, state.loss, state.residual)
+    state.fused = problem.backend.fused_step(model, plan, before)
+    return state.fused
+
+
+def settle(state: FitState) -> None:
+    """Wait until the arrays of a state hold all its steps: before they are read."""
+    if state.fused is not None:
+        state.fused.settle()
+
+
+def _by_operations(
+    state: FitState, problem: FitProblem, settings: FitSettings, views: Sequence[int], box: _RandomBox | None,
+    weight: float,
+    update: _Update,
+) -> None:  # fmt: skip
+    """One step, operation by operation."""
     p, geometry, backend, cut = state.parameters, problem.geometry, problem.backend, settings.truncation
     run = backend.begin(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel)
     loss: Any = 0.0
-    share = settings.views_per_step
-    for k in range(share):
-        chosen = _draw(state, geometry.n_views) if view is None or k else view
-        target, weights = problem.images[chosen], problem.weights[chosen]
-        seen = run.view(geometry, chosen, cut.faint, cut.sigmas, settings.rays)
-        value, slope = problem.loss(seen.image, target, problem.target_maps[chosen], weights)
+    share = len(views)
+    for view in views:
+        target, weights = problem.images[view], problem.weights[view]
+        seen = run.view(geometry, view, cut.faint, cut.sigmas, settings.rays)
+        value, slope = problem.loss(seen.image, target, problem.target_maps[view], weights)
         state.residual = _running(state.residual, backend.misfit(seen.image, target, weights))
         if share > 1:
             slope /= share
         centres = seen.backward(slope)
         backend.add_lengths(centres, share * geometry.detector_shape[1] / 2, state.statistic)
-        state.seen += 1
         loss = loss + value / share  # type: ignore[operator]
-    weight = tv_weight(settings, problem, state.limit)
-    if weight > 0:
-        loss = loss + _smooth(state, problem, settings, weight, run)
+    if box is not None:
+        loss = loss + _smooth(problem, settings, weight, run, box.grid(problem.grid))
     state.loss = _running(state.loss, loss)
-
-    state.step += 1
-    _update(state, run.gradients(), problem, settings, fraction)
-    if state.step % NORMALISE == 0:
-        _normalise_quaternions(state, backend)
-    policy = settings.policy
-    if policy is not None and state.step % policy.every == 0 and policy.start <= fraction < policy.stop:
-        _grow(state, problem, policy)
-    return state
+    parameters, first, second = (
+        [arrays[name] for name in NAMES] for arrays in (state.parameters, state.first, state.second)
+    )
+    backend.adam(parameters, run.gradients(), first, second, update.rates, state.step, update.bounds)
 
 
 def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> float:
@@ -151,6 +256,7 @@ def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> fl
 
 def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: Iterable[int]) -> Iterator[Any]:
     """The model's render of these views [row, col], in units of the problem's images, on its device."""
+    settle(state)
     p, cut = state.parameters, settings.truncation
     run = problem.backend.begin(
         p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel
@@ -163,6 +269,7 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
     """A copy of the model."""
     import torch
 
+    settle(state)
     device = backend or Cpu()
     means, log_scales, quaternions, raw = (
         torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES
@@ -192,53 +299,28 @@ def _running(mean: Any, value: Any) -> Any:
     return value if isinstance(mean, float) and np.isnan(mean) else 0.95 * mean + 0.05 * value
 
 
-def _smooth(state: FitState, problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any]) -> Any:
-    """Total variation on a random box of voxels, in normalised density."""
-    grid = problem.grid
-    side = tv_size(settings, grid)
-    size = tuple(min(side, n) for n in grid.shape)
-    corner = [int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, size, strict=True)]
-    box = grid.part(*(slice(c, c + s) for c, s in zip(corner, size, strict=True)))
+def _smooth(problem: FitProblem, settings: FitSettings, weight: float, run: Pass[Any], box: Grid) -> Any:
+    """Total variation on a box of voxels, in normalised density."""
     cut = settings.truncation
-    found = run.box(box, cut.faint / problem.half_field, cut.sigmas)
+    filled = run.box(box, cut.faint / problem.half_field, cut.sigmas)
     half = np.float32(problem.half_field)
-    loss, slope = problem.backend.total_variation(found.density * half, weight)
-    found.backward(slope * half, means_too=settings.tv_moves)
+    loss, slope = problem.backend.total_variation(filled.density * half, weight)
+    filled.backward(slope * half, means_too=settings.tv_moves)
     return loss
-
-
-def _update(
-    state: FitState, gradients: tuple[Any, ...], problem: FitProblem, settings: FitSettings, fraction: float
-) -> None:
-    shrink = settings.pace * settings.decay**fraction
-    rates = [
-        rate * shrink * (problem.half_field if name == "means" else 1.0)
-        for name, rate in zip(NAMES, settings.rates, strict=True)
-    ]
-    parameters, first, second = (
-        [arrays[name] for name in NAMES] for arrays in (state.parameters, state.first, state.second)
-    )
-    smallest = settings.smallest * problem.geometry.sample_pitch
-    widths = (float(np.log(smallest)), float(np.log(problem.half_field)))
-    problem.backend.adam(parameters, gradients, first, second, rates, state.step, (None, widths, None, None))
 
 
 def _normalise_quaternions(state: FitState, backend: Backend[Any]) -> None:
     """Quaternions of length 1 that turn as before, with Adam's moments in their measure.
 
     A gradient is orthogonal to its quaternion, so that every step makes the quaternion longer and the next turn
-    smaller. Without this it is twice as long after 30 000 steps. Quaternions without a direction stay as they are.
+    smaller. Without this it is twice as long after 30 000 steps.
     """
-    values = backend.numpy(state.parameters["quaternions"]).astype(np.float64)
-    length = np.linalg.norm(values, axis=1, keepdims=True)
-    length[length < 1e-12] = 1
-    state.parameters["quaternions"] = backend.array((values / length).astype(np.float32))
-    for moments, power in ((state.first, 1), (state.second, 2)):
-        scaled = backend.numpy(moments["quaternions"]) * length**power
-        moments["quaternions"] = backend.array(scaled.astype(np.float32))
+    settle(state)
+    backend.unit_quaternions(*(arrays["quaternions"] for arrays in (state.parameters, state.first, state.second)))
 
 
 def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
+    settle(state)
     backend = problem.backend
     p = {name: backend.numpy(state.parameters[name]) for name in NAMES}
     active = Active.of(p["means"], p["log_scales"], p["quaternions"], p["raw"], 1.0)
@@ -265,10 +347,9 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
             changed[fresh:] = True
             state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}
+    origin[fresh:] = -1  # copies start without momentum
     for moments in (state.first, state.second):
         for name in NAMES:
-            values = backend.numpy(moments[name])[origin]
-            values[fresh:] = 0  # copies start without momentum
-            moments[name] = backend.array(values[order])
+            moments[name] = backend.taken(moments[name], origin[order])
     state.statistic = backend.array(np.zeros(state.n, np.float32))
     state.seen = 0

@@ -158,5 +158,6 @@ def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     assert found.exit_code == 0 and "40 x 48 x 48 voxels by sirt, from 90 views" in found.stdout, found.output
     geometry = seen[0][0]
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
-    small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--dry-run", "--memory", "1M")
-    assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr
+    for words in (("--dry-run",), ()):
+        small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--memory", "1M", *words)
+        assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr

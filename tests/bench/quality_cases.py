@@ -20,9 +20,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection
-from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
@@ -104,9 +101,13 @@ def walnut_halved(folder: Path, views: int) -> Case:
 
 def diamond(folder: Path, views: int) -> Case:
     """32 rows of Diamond 24737, at most 76 of its 91 views; the other 15 judge."""
+    from beamline.projections.prepare import prepare_projections  # a machine that fits Gaussians has no readers
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.open import SourceOptions
+
     with SourceOptions(folder / "diamond_24737_parallel_91x135x160.h5").open() as source:
         prepared = prepare_projections(source, Selection(rows=(65, 97), axis_col=85.75), lambda _: None)
-    data, rays = np.asarray(prepared.projections.data), prepared.rays_there()
+    data, rays = np.asarray(prepared.projections.data), prepared.without_warnings.ray_weights()
     rays = np.ones_like(data) if rays is None else np.broadcast_to(rays, data.shape)
     judges = np.arange(3, 91, 6)
     others = np.setdiff1d(np.arange(91), judges)

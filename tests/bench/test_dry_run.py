@@ -22,10 +22,11 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Method
+from recon.base.method import Method, candidates_of
 from recon.base.volume import Grid
 from recon.base.work import Rate, costs_of, seconds_of
 from recon.machine_speed import measured_rate
+from recon.methods import by_name, names_compared
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 
@@ -67,10 +68,11 @@ SCANS: dict[str, Callable[[], Views]] = {
     "tooth 181 x 2 x 640": lambda: _scan("aps2bm_tooth_181x2x640.h5", axis_col=295.6),
     "teapot, cone 50 x 97 x 144": lambda: _cone(50),
 }
-METHODS: tuple[Method, ...] = (
+_SHORT: tuple[Method, ...] = (
     recon.Fbp(), recon.Sirt(iterations=20), recon.Sart(iterations=3), recon.Cgls(), recon.AsdPocs(iterations=3),
     recon.FistaTv(), recon.OsSirtTv(), recon.PnpDct(), recon.R2(steps=200, finish=0), recon.R2(), recon.Auto(),
 )  # fmt: skip
+METHODS = (*_SHORT, *(by_name(name)() for name in names_compared() if name not in {each.name for each in _SHORT}))
 SHARES: list[float] = []  # expected over taken, of all runs so far
 
 
@@ -95,7 +97,7 @@ def _named(method: Method) -> str:
 @pytest.mark.parametrize("scan", SCANS)
 def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -> None:
     (data, geometry), now = _views(scan), time.process_time
-    for each in getattr(method, "candidates", (method,)):
+    for each in candidates_of(method):
         warm_up(each, geometry)
     costs = costs_of(method, [(geometry, Grid.matching(geometry))])
     assert costs is not None

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
-from contextlib import redirect_stdout
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -37,18 +34,20 @@ def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...])
 
 
 def _needs_of(config: Path | None, beside: Path, scan: str) -> ScanNeed:
-    """What `beamline recon SCAN --dry-run` says of an output on the disk of the folder `beside`."""
-    from beamline.cli.recon import recon  # the batch itself needs none of it
+    """What the reconstruction of a scan takes, with its output on the disk of the folder `beside`."""
+    from beamline.cli.recon import options_of, recon  # the batch itself needs none of it
+    from beamline.core.machine_speed import MachineSpeed
+    from beamline.reconstruct.estimate import estimate
 
-    recipe, lines = [] if config is None else ["--config", str(config)], io.StringIO()
+    recipe = [] if config is None else ["--config", str(config)]
     try:
-        with TemporaryDirectory(prefix=".beamline-", dir=beside) as work, redirect_stdout(lines):
-            arguments = [scan, *recipe, "--output", str(Path(work) / RECON), "--dry-run", "--json"]
-            recon.main(arguments, prog_name="beamline recon", standalone_mode=False)
+        with TemporaryDirectory(prefix=".beamline-", dir=beside) as work:
+            words = [scan, *recipe, "--output", str(Path(work) / RECON)]
+            with recon.make_context("beamline recon", words) as context:
+                needs = estimate(options_of(context), MachineSpeed())
     except (BeamlineError, click.ClickException) as error:
         return ScanNeed(refusal=error.format_message() if isinstance(error, click.ClickException) else str(error))
-    told = json.loads(lines.getvalue().splitlines()[-1])
-    return ScanNeed(**{each.name: told[each.name] for each in fields(Need) if each.name in told})
+    return ScanNeed(**{each.name: getattr(needs, each.name) for each in fields(Need)})
 
 
 @click.command()

@@ -1,4 +1,4 @@
-"""The shell: manual pages, and completion of commands and options."""
+"""Completion of commands and options in a shell."""
 
 from __future__ import annotations
 
@@ -8,12 +8,6 @@ COMMANDS = {
     "completion": CommandEntry(
         "beamline.features.completion.command",
         "Print the completion script of a shell.",
-        Libraries.NONE,
-        files=False,
-    ),
-    "man": CommandEntry(
-        "beamline.features.completion.command",
-        "Print the manual page of a command.",
         Libraries.NONE,
         files=False,
     ),

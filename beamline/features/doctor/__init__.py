@@ -1,8 +1,8 @@
-"""What this computer can do: checks of its devices, disk and memory, and measurements of its speed."""
+"""Checks of this computer: its devices, disk and memory."""
 
 from __future__ import annotations
 
-from beamline.cli.commands import CommandEntry, Libraries
+from beamline.cli.commands import CommandEntry
 
 COMMANDS = {
     "doctor": CommandEntry(
@@ -10,10 +10,4 @@ COMMANDS = {
         "Check this computer: camera link, ports, disk, memory. Nothing moves.",
         files=False,
     ),
-    "bench": CommandEntry(
-        "beamline.features.doctor.bench",
-        "Measure this machine: kernels, fits, quality against time, and acquisition.",
-        Libraries.FITS,
-    ),
 }
-COUNTED = {"bench": "runs"}

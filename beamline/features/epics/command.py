@@ -27,10 +27,11 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
 
     Exit code: 0 ended by Ctrl-C, 2 p4p is not installed, 5 the address cannot be listened at.
     """
-    from beamline.features.epics.ioc import PERIOD, RunServer
+    from beamline.features.epics.ioc import RunServer
+    from beamline.page.followed_run import PERIOD
 
     with closing(RunServer(runs, prefix, bind, control, say)) as server, suppress(KeyboardInterrupt):
-        click.echo(f"{prefix}ScanStatus and others at {bind} (docs/epics.md). Ctrl-C ends this, not the scan.")
+        click.echo(f"{prefix}ScanStatus and others at {bind} (docs/page.md). Ctrl-C ends this, not the scan.")
         while True:
             server.look()
             time.sleep(PERIOD)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ import click
 from beamline.cli.options import (
     FiniteRange,
     NameChoice,
+    WholeRange,
     dataset_option,
     json_events,
     json_option,
@@ -24,17 +26,77 @@ from beamline.cli.options import (
     with_request,
 )
 from beamline.cli.recipe import Repeatable, names_given
+from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Done
+from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing
+from beamline.core.sinks import Warnings
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import count, size
-from beamline.features.export.film import AXES, SUFFIXES, VIEWS, export_film
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
+    from beamline.features.export.film_file import FilmImages, FilmStyle, WrittenFilm
     from beamline.storage.recon_record import ReconRecord
+
+VIEWS, AXES = "views", "zyx"
+SUFFIXES = (".gif", ".mp4")
+
+
+def export_film(of: str, file: Path, output: Path, style: FilmStyle, dataset: tuple[str | None, int | None],
+                as_json: bool) -> None:  # fmt: skip
+    """Write the film and print what it shows.
+
+    Args:
+        of: "z", "y", "x" or "views".
+        dataset: of a volume: which array, and which volume of a series in time.
+    """
+    from beamline.features.export.film_file import write_film
+
+    clock = SystemClock()
+    with events_shown(as_json) as sink:
+        refuse_existing(output)
+        with _images(of, file, style, dataset, sink) as images:
+            made = write_film(output, images, style, counting("images", sink, clock))
+        every = images.shown[1] - images.shown[0] if of != VIEWS and len(images.shown) > 1 else 1
+        facts = {"output": output, "film": of, "images": made.images, "shape": made.shape, "fps": made.fps}
+        sink(Done({**facts, "window": made.window}, time=clock.now()))
+    if not as_json:
+        click.echo("\n".join(_lines(output, of, made, every)))
+
+
+@contextmanager
+def _images(
+    of: str, file: Path, style: FilmStyle, dataset: tuple[str | None, int | None], sink: Sink
+) -> Iterator[FilmImages]:
+    from beamline.features.export.film_file import slices_along
+
+    if of != VIEWS:
+        from beamline.storage.volumes.files import opened_volume
+
+        with opened_volume(file, *dataset) as record:
+            yield slices_along(record, AXES.index(of), style.side)
+        return
+    from beamline.features.export.view_film import views_by_angle
+    from beamline.storage.readers.open import SourceOptions
+
+    with SourceOptions(file, frames_per_view=None).open() as source:
+        yield views_by_angle(source, style.side, Warnings(sink, SystemClock()))
+
+
+def _lines(output: Path, of: str, made: WrittenFilm, every: int) -> list[str]:
+    shown = "views by angle" if of == VIEWS else f"slices along {of}"
+    if every > 1:
+        shown += f", one of {every}"
+    rows, cols = made.shape
+    low, high = made.window
+    length = f"{made.images / made.fps:.1f} s, {made.fps:.3g} a second"
+    return [
+        f"output   {output}",
+        f"film     {made.images} {shown}, {cols} x {rows} pixels; {length}",
+        f"window   {low:.4g} (black) to {high:.4g} (white)",
+    ]
 
 
 def window_of(text: str) -> tuple[float, float]:
@@ -91,7 +153,7 @@ class ExportRequest:
         help="Of a film: images a second. A .gif takes the nearest that it can state: 50, 33.3, 25, 20 ...",
     )  # fmt: skip
     side: int = set_by(
-        "--side", type=click.IntRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
+        "--side", type=WholeRange(16, 2048), default=640, show_default=True, needs=("film", "is of --film."),
         help="Of a film: pixels of an image's longer side, at most; pixels are averaged, never enlarged.",
     )  # fmt: skip
     gaussians: bool = set_by("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
@@ -99,7 +161,7 @@ class ExportRequest:
         "--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads."
     )
     at: int | None = set_by(
-        "--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
+        "--at", type=WholeRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)

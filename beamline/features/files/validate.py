@@ -13,10 +13,10 @@ import numpy as np
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.features.files.nexus import nexus_findings
-from beamline.features.files.volume import volume_findings
 from beamline.storage import hdf5
 from beamline.storage.readers.base import LookedEnoughError, ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import VIEWS, reference_groups, references_usable, some_of
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
@@ -25,6 +25,34 @@ from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
+
+
+def volume_findings(record: ReconRecord) -> Iterator[Finding]:
+    """What the rules find in a volume; every slice of it is read."""
+    data, n = record.volume.data, record.volume.grid.shape[0]
+    bad, first, low, high = 0, None, np.inf, -np.inf
+    for z in range(n):
+        values = np.asarray(data[z : z + 1])
+        finite = np.isfinite(values)
+        if not finite.all():
+            bad, first = bad + int((~finite).sum()), z if first is None else first
+        if finite.any():
+            low, high = min(low, float(values[finite].min())), max(high, float(values[finite].max()))
+    if bad:
+        yield Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")
+    if low == high:
+        yield Finding("error", "voxels", f"Every voxel is {low:g}.")
+    if there := record.parameters.get("partial"):
+        yield Finding(
+            "error", "partial", f"Partial: {there} are there, the others are empty. recon --resume makes them."
+        )
+    if record.ending.early:
+        yield Finding("warning", "ended-early", "The reconstruction was stopped early; this is what it had reached.")
+    if record.length_unit != "mm":
+        yield Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")
+    if record.parameters and not Path(record.raw_file).exists():
+        yield Finding("info", "raw-file", f"The scan that it was made from, {record.raw_file}, is not there.")
+
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 
 from beamline.cli.options import (
     FiniteRange,
@@ -17,12 +19,65 @@ from beamline.cli.options import (
     volume_argument,
 )
 from beamline.cli.terminal import counting, events_shown
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.core.events import Done
-from beamline.core.files import refuse_existing
-from beamline.features.models.mesh_file import MESHES, write_mesh
+from beamline.core.files import refuse_existing, whole_file
 from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
+
+if TYPE_CHECKING:
+    from recon.features.surfaces.mesh import Mesh
+
+_TOGETHER = 2**16  # triangles or vertices
+
+
+def _stl_bytes(mesh: Mesh, unit: str) -> Iterator[bytes]:
+    """Header of 80 bytes, count, then of each triangle normal, corners and a spare number (little-endian)."""
+    yield f"binary STL by splatline, lengths in {unit}".encode().ljust(80)
+    yield np.uint32(len(mesh.faces)).astype("<u4").tobytes()
+    for first in range(0, len(mesh.faces), _TOGETHER):
+        corners = mesh.vertices[mesh.faces[first : first + _TOGETHER]].astype(np.float64)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        rows = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("spare", "<u2")])
+        rows["normal"] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        rows["corners"] = corners
+        yield rows.tobytes()
+
+
+def _ply_bytes(mesh: Mesh, unit: str) -> Iterator[bytes]:
+    yield (
+        f"ply\nformat binary_little_endian 1.0\ncomment splatline, lengths in {unit}\nelement vertex "
+        f"{len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\nelement face {len(mesh.faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    yield mesh.vertices.astype("<f4").tobytes()
+    for first in range(0, len(mesh.faces), _TOGETHER):
+        corners = mesh.faces[first : first + _TOGETHER]
+        rows = np.full(len(corners), 3, [("n", "u1"), ("corners", "<i4", 3)])
+        rows["corners"] = corners
+        yield rows.tobytes()
+
+
+def _obj_bytes(mesh: Mesh, unit: str) -> Iterator[bytes]:
+    yield f"# splatline, lengths in {unit}\n".encode()
+    for first in range(0, len(mesh.vertices), _TOGETHER):
+        yield b"".join(b"v %.9g %.9g %.9g\n" % tuple(v) for v in mesh.vertices[first : first + _TOGETHER].tolist())
+    for first in range(0, len(mesh.faces), _TOGETHER):
+        yield b"".join(b"f %d %d %d\n" % tuple(f) for f in (mesh.faces[first : first + _TOGETHER] + 1).tolist())
+
+
+MESHES = {".stl": _stl_bytes, ".ply": _ply_bytes, ".obj": _obj_bytes}
+
+
+def write_mesh(path: Path, mesh: Mesh, unit: str) -> None:
+    """Write a mesh in the format that the suffix names, one of MESHES.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses; nothing is left.
+    """
+    with whole_file(path) as partial, partial.open("wb") as file:
+        for part in MESHES[path.suffix.lower()](mesh, unit):
+            file.write(part)
 
 
 def _mesh_path(text: str) -> Path:
@@ -44,11 +99,8 @@ def _mesh_path(text: str) -> Path:
 def surface(volume: Path, output: Path, level: float | None, source: str, dataset: str | None, as_json: bool) -> None:
     """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm where the voxel is known).
 
-    The mesh is watertight: matter that leaves the volume is closed at its faces. Needs: pip install
-    "splatline[surface]". Nothing is overwritten.
+    The mesh is watertight: matter that leaves the volume is closed at its faces. Nothing is overwritten.
     """
-    if importlib.util.find_spec("skimage") is None:
-        raise ConfigError('A surface needs scikit-image: pip install "splatline[surface]". Nothing was written.')
     from beamline.features.models.surface import surface_of_gaussians, surface_of_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import say
+from beamline.cli.options import WholeRange, say
 from beamline.cli.page_beside import ACT, ENDS_WITHIN, LOOK
 from beamline.core.files import RUNS
 from beamline.core.process import at_end_of
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 LOOPBACK, PORT = "127.0.0.1", 8642
 
 port_option = click.option(
-    "--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Or the next free one."
+    "--port", default=PORT, show_default=True, type=WholeRange(0, 65535), help="Or the next free one."
 )
 bind_option = click.option(
     "--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all."
@@ -31,7 +31,7 @@ bind_option = click.option(
 
 
 @click.command()
-@click.argument("path", metavar="[RUN|FILE|RUNS]", required=False, type=click.Path(path_type=Path, exists=True))
+@click.argument("path", metavar="[RUN|FILE|RUNS]", required=False, type=click.Path(path_type=Path))
 @click.option("--control", is_flag=True, help="A second address, from which the scan can be paused and ended.")
 @port_option
 @bind_option
@@ -46,6 +46,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
+    from beamline.core.errors import ConfigError
     from beamline.features.page.app import page  # these load HDF5 and the server, which `scan -h` does not need
     from beamline.features.page.serve import open_port, start
     from beamline.page.run_files import Reader, watched
@@ -54,6 +55,10 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     from beamline.storage.writer_lock import held
 
     folder = path or Path(RUNS)
+    if path is not None and not path.exists():
+        there = ", ".join(run.name for run in runs_in(Path(RUNS))[:5])
+        held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
+        raise ConfigError(f"there is no file or folder {path}; {held_runs}.")
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
     if not held(what.scan) and (advice := next_step(what.scan)):
         click.echo(advice, err=True)

@@ -15,6 +15,7 @@ from beamline.cli.options import (
     SEED,
     FiniteRange,
     NameChoice,
+    WholeRange,
     json_events,
     json_option,
     volume_argument,
@@ -52,11 +53,11 @@ _PERCENT = FiniteRange(min=0, max=100)
     "--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Width of the Gaussian filter, voxels."
 )
 @click.option(
-    "--clusters", type=click.IntRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
+    "--clusters", type=WholeRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
 )
-@click.option("--radius", type=click.IntRange(0, 20), default=1, show_default=True,
+@click.option("--radius", type=WholeRange(0, 20), default=1, show_default=True,
               help="Radius of opening and closing, voxels; 0: neither.")  # fmt: skip
-@click.option("--smallest", type=click.IntRange(min=0), default=27, show_default=True,
+@click.option("--smallest", type=WholeRange(min=0), default=27, show_default=True,
               help="Voxels of the smallest particle that is kept.")  # fmt: skip
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
               help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "

@@ -2,35 +2,295 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import click
 
 from beamline.cli.options import json_events
-from beamline.cli.scan import ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
-from beamline.core.events import Done, Sink
+from beamline.cli.scan import TABLE, ScanRequest, faults_of, rehearsed_lines, run_one, take_energies
+from beamline.config.load import Config, load
+from beamline.core.errors import AlarmError, BeamlineError, ConfigError, ScanStopped, exit_code, user_message
+from beamline.core.events import Done, Event, RunStarted, Sink, StateEntered
+from beamline.core.files import SETTINGS, text_in
 from beamline.core.stop import StopRequest
-from beamline.features.queue.queue import (
-    QueuedScan,
-    RunNotes,
-    TakenScan,
-    load_queue,
-    queue_needs,
-    raise_unless_complete,
-    run_queue,
-    summary,
-)
+from beamline.core.text import count, size
 from beamline.instrument.operator import ask_operator
+from beamline.plan.limits import ROOM
+from beamline.plan.timeline import duration_text
+from beamline.scan.preflight import DryRun, dry_run
+from beamline.scan.run import UNSAFE
 from drivers.base.clock import SystemClock
+
+_CONFIG = "config"  # the column with the configuration's file
+
+
+@dataclass(frozen=True, eq=False)
+class QueuedScan:
+    """A scan that waits for its turn: its sample's name, and its configuration."""
+
+    name: str
+    config: Config
+
+
+class QueueStatus(StrEnum):
+    """What became of a scan in a queue."""
+
+    COMPLETE = "complete"
+    ALARMS = "alarms"
+    FAILED = "failed"
+    STOPPED = "stopped"
+    NOT_STARTED = "not started"
+
+
+@dataclass(frozen=True)
+class RecordedScan:
+    """A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
+
+    path: Path
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScanOutcome:
+    """What became of a scan of a queue, where it is, and why it is not complete."""
+
+    name: str
+    status: QueueStatus
+    path: Path | None = None
+    why: str = ""
+    exit_code: int = 0
+
+
+class RunNotes:
+    """A sink that notes the folder of a queue's scan, and whether a device could not be brought to rest."""
+
+    def __init__(self) -> None:
+        self.folder: Path | None = None
+        self.unsafe = False
+
+    def __call__(self, event: Event) -> None:
+        if isinstance(event, RunStarted):
+            self.folder = event.folder
+        elif isinstance(event, StateEntered) and event.message == UNSAFE:
+            self.unsafe = True
+
+
+class QueueError(BeamlineError):
+    """Some scans of a queue are not complete; it exits as the first of them would have."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.exit_code = code
+
+
+def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: bool = False) -> tuple[QueuedScan, ...]:
+    """The scans of these configurations and tables, in their order.
+
+    A table is a CSV file. Its first line names the column `config`, the file of a configuration (relative to the
+    table), and keys of configurations, whose values go before those of the file; an empty cell changes nothing.
+
+    Args:
+        overrides: of all scans, after those of a table.
+
+    Raises:
+        ConfigError: every scan that cannot be, with what is wrong. Nothing was started.
+    """
+    scans, faults = [], []
+    for file in files:
+        try:
+            rows = list(_rows(file)) if file.suffix.lower() == TABLE else [("", file, ())]
+        except ConfigError as error:
+            faults.append(str(error))
+            continue
+        for place, config_file, own in rows:
+            try:
+                config = load(config_file, (*own, *overrides), rehearse=rehearse)
+            except ConfigError as error:
+                faults.append(f"{place}{error}")
+            else:
+                scans.append(QueuedScan(config.sample.name, config))
+    if faults:
+        raise ConfigError(faults[0] if len(faults) == 1 else "".join(["the queue has faults:", *_indented(faults)]))
+    return tuple(scans)
+
+
+def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
+    """Place, configuration and overrides of each line of a table."""
+    try:
+        reader = csv.reader(io.StringIO(text_in(table, SETTINGS), newline=""), strict=True)
+        numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except (OSError, csv.Error) as error:
+        raise ConfigError(f"{table} cannot be read as a table ({error}). Nothing was started.") from None
+    head = numbered[0][1] if numbered else []
+    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
+        raise ConfigError(
+            f"{table} is no table of scans: expected a line of names, such as config,sample.name,scan.exposure_s, each "
+            "once, and a line for each scan. Nothing was started."
+        )
+    for number, row in numbered[1:]:
+        if not any(row):
+            continue
+        cells = dict(zip(head, row, strict=False))
+        if len(row) > len(head) or not cells.get(_CONFIG):
+            raise ConfigError(
+                f"{table}, line {number}: {','.join(row)!r} has {count(len(row), 'cell')}; expected {len(head)}, with "
+                f"a file under {_CONFIG}. Nothing was started."
+            )
+        own = tuple(f"{key}={value}" for key, value in cells.items() if key != _CONFIG and value)
+        yield f"{table}, line {number}: ", table.parent / cells[_CONFIG], own
+
+
+@dataclass(frozen=True, eq=False)
+class QueueNeeds:
+    """What the scans of a queue need: each worked out without devices, by name."""
+
+    scans: tuple[tuple[str, DryRun], ...]
+
+    @property
+    def duration(self) -> float:
+        """s for all scans, without the time to change samples."""
+        return sum(map(_seconds, self._worked))
+
+    @property
+    def total_bytes(self) -> int:
+        """Of the files of all scans."""
+        return sum(worked.total_bytes for worked in self._worked)
+
+    @property
+    def free_bytes(self) -> int:
+        """Of the fullest disk."""
+        return min(worked.free_bytes for worked in self._worked)
+
+    @property
+    def _worked(self) -> list[DryRun]:
+        return [worked for _, worked in self.scans]
+
+    def lines(self) -> list[str]:
+        """A line for each scan, and the sum."""
+        lines = [f"{'scan':<24}  {'frames':>8}  {'size':>8}  time"]
+        for name, worked in self.scans:
+            times = len(worked.energies) or 1
+            cells = f"{times * worked.timeline.n_frames:>8}  {size(worked.total_bytes):>8}"
+            lines.append(f"{name:<24}  {cells}  {duration_text(_seconds(worked))}")
+        total = f"{size(self.total_bytes)} of {size(self.free_bytes)} free, {duration_text(self.duration)}"
+        return [*lines, "", f"{count(len(self.scans), 'scan')}: {total}, without what is done between them"]
+
+    def data(self) -> Mapping[str, Any]:
+        """For a program: s and bytes of each scan and of all."""
+        each = [{**worked.data(), "sample": name, "duration": _seconds(worked)} for name, worked in self.scans]
+        totals = {"duration": self.duration, "total_bytes": self.total_bytes, "free_bytes": self.free_bytes}
+        return {"scans": each, **totals}
+
+    def refuse_impossible(self) -> None:
+        """ConfigError for scans that break a limit, or that the disk does not hold together. Nothing was started."""
+        faults = [f"{name}: {text}" for name, worked in self.scans for text in worked.timeline.violations]
+        if not faults and self.total_bytes * ROOM > self.free_bytes:
+            faults.append(
+                f"{count(len(self.scans), 'scan')} need {size(self.total_bytes)} and a tenth more, the disk has "
+                f"{size(self.free_bytes)} free; free some, or choose another storage.folder"
+            )
+        if faults:
+            raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
+
+
+def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
+    """Work out the scans of a queue without devices; `place`: as of `run_scan`.
+
+    Raises:
+        ConfigError: of the first scan that cannot be worked out, with its name.
+    """
+    scans = []
+    for waiting in queue:
+        try:
+            scans.append((waiting.name, dry_run(waiting.config, place)))
+        except ConfigError as error:
+            raise ConfigError(f"{waiting.name}: {error}") from error
+    return QueueNeeds(tuple(scans))
+
+
+def run_queue(
+    queue: Sequence[QueuedScan],
+    take: Callable[[int, QueuedScan, StopRequest, RunNotes], RecordedScan],
+    *,
+    stop_on_failure: bool = False,
+) -> tuple[ScanOutcome, ...]:
+    """Take the scans of a queue. A failed one does not keep the next from its turn, unless `stop_on_failure`.
+
+    It ends where somebody stopped a scan (Ctrl-C, a signal, `beamline stop`), and where an instrument did not obey.
+
+    Args:
+        take: takes a scan, the n-th from 0 on, tells its events to the last argument, and raises what `run_scan` does.
+    """
+    outcomes: list[ScanOutcome] = []
+    ended = ""
+    for n, waiting in enumerate(queue):
+        if ended:
+            outcomes.append(ScanOutcome(waiting.name, QueueStatus.NOT_STARTED, None, ended, ScanStopped.exit_code))
+            continue
+        stop, run = StopRequest(), RunNotes()
+        try:
+            taken = take(n, waiting, stop, run)
+        except (Exception, KeyboardInterrupt) as error:
+            asked = stop.by_person or isinstance(error, KeyboardInterrupt)
+            status = QueueStatus.STOPPED if asked else QueueStatus.FAILED
+            outcomes.append(ScanOutcome(waiting.name, status, run.folder, user_message(error), exit_code(error)))
+            ended = "somebody stopped the queue" if asked else f"{waiting.name} failed" if stop_on_failure else ""
+        else:
+            status = QueueStatus.ALARMS if taken.faults else QueueStatus.COMPLETE
+            code = AlarmError.exit_code if taken.faults else 0
+            outcomes.append(ScanOutcome(waiting.name, status, taken.path, " ".join(taken.faults), code))
+            ended = "somebody stopped the queue" if stop.by_person else ""
+        if run.unsafe:
+            ended = f"stage, camera or shutter did not obey at the end of {waiting.name}"
+    return tuple(outcomes)
+
+
+def summary(outcomes: Sequence[ScanOutcome]) -> list[str]:
+    """A line for each scan."""
+    width = max((len(outcome.name) for outcome in outcomes), default=0)
+    return [
+        f"{outcome.name:<{width}}  {outcome.status:<11}  {outcome.path or ''}  {outcome.why}".rstrip()
+        for outcome in outcomes
+    ]
+
+
+def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:
+    """QueueError where a scan is not complete; AlarmError where all are, and some have alarms."""
+    bad = [outcome for outcome in outcomes if outcome.status not in (QueueStatus.COMPLETE, QueueStatus.ALARMS)]
+    alarmed = [outcome for outcome in outcomes if outcome.status is QueueStatus.ALARMS]
+    if bad:
+        code = bad[0].exit_code
+        whole = len(outcomes) - len(bad)
+        others = ", ".join(f"{outcome.name} {outcome.status}" for outcome in bad)
+        raise QueueError(f"{whole} of {len(outcomes)} scans are complete: {others}.", code)
+    if alarmed:
+        raise AlarmError(f"All scans are complete, but {alarmed[0].name}: {alarmed[0].why} Look at {alarmed[0].path}.")
+
+
+def _indented(lines: Sequence[str]) -> list[str]:
+    return [f"\n  {line}" for line in lines]
+
+
+def _seconds(worked: DryRun) -> float:
+    return sum(need.duration for need in worked.energies) if worked.energies else worked.timeline.duration
 
 
 def take_all(request: ScanRequest) -> None:
     """Take the scans of a queue, or work them out, and print what became of each."""
     with json_events(request.as_json) as json_sink:
         queue = load_queue(request.files, request.overrides, rehearse=request.rehearse)
+        if request.discard and (series := [scan.name for scan in queue if scan.config.scan.energies is not None]):
+            names = ", ".join(series)
+            raise click.UsageError(f"--discard does not go with scan.energies, of {names}: leave it out.")
         needs = queue_needs(queue, request.output)
         if request.dry:
             if not request.as_json:
@@ -52,7 +312,7 @@ def take_all(request: ScanRequest) -> None:
 
 def _take_next(
     request: ScanRequest, of: int, json_sink: Sink, n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes
-) -> TakenScan:
+) -> RecordedScan:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
         ask_operator(f"Scan {n + 1} of {of}: bring {waiting.name} to its place.")
@@ -60,9 +320,9 @@ def _take_next(
     sinks: list[Sink] = [json_sink, run]
     if waiting.config.scan.energies is not None:
         done = take_energies(waiting.config, request, sinks, stop)
-        return TakenScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
+        return RecordedScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
     with ExitStack() as held:
         result = run_one(waiting.config, None, request, sinks, held, stop)
     if request.rehearse:
         click.echo("\n".join(rehearsed_lines(waiting.config, result, request)), err=True)
-    return TakenScan(result.path, tuple(faults_of(result)))
+    return RecordedScan(result.path, tuple(faults_of(result)))

@@ -7,12 +7,12 @@ import io
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.method_options import method_with, preset_of, settings_of
 from beamline.cli.options import (
     Declared,
     dry_option,
@@ -20,19 +20,16 @@ from beamline.cli.options import (
     json_option,
     name_of,
     option,
-    refuse_contradictions,
-    rules_of,
 )
 from beamline.cli.recipe import names_given
-from beamline.cli.recon import recon
-from beamline.cli.selection_options import chosen
+from beamline.cli.recon import options_of, recon
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.sinks import Warnings
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
-from beamline.reconstruct.option_rules import of_other_methods
+from beamline.report.metrics import METRICS
 from drivers.base.clock import SystemClock
 from recon.methods import BASELINE
 
@@ -93,7 +90,7 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
     slices, scores = _run(trials, options, path, as_json)
     if not as_json:
         click.echo(f"{_lines(slices, scores)}\nsheet     {path}\ntable     {table}")
-        if scores is not None:
+        if scores is not None and scores.best is not None:
             best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
             again = shlex.join(["beamline", "recon", *common, *best])
             click.echo(f"If the pictures agree: {again}", err=True)
@@ -152,30 +149,12 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
 
 
 def _options(context: click.Context) -> ReconOptions:
-    """The options of one reconstruction."""
-    from beamline.reconstruct.options import ReconOptions
+    """The options of one reconstruction, of which no volume is written."""
     from beamline.reconstruct.output_paths import OutputPaths
 
-    values, given = dict(context.params), names_given(context)
-    if foreign := sorted(given & _OF_A_VOLUME):
+    if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
-    refuse_contradictions(recon, given)
-    method = preset_of(values["method"], values["preset"]) or BASELINE
-    if why := of_other_methods(rules_of(recon), given, method, stated=values["method"] is not None):
-        raise click.UsageError(why)
-    source, selection = chosen(values["file"], values["seed"], values)
-    settings = settings_of(recon, values) | {"filter": values["filter"]}
-    return ReconOptions(
-        source=source,
-        target=OutputPaths(Path("slice.h5"), None, written=False),
-        selection=selection,
-        method=method_with(method, settings, values["any_setting"]),
-        quality=values["quality"],
-        device=values["device"],
-        filter=values["filter"],
-        seed=values["seed"],
-        unfinished=values["unfinished"],
-    )
+    return replace(options_of(context, BASELINE), target=OutputPaths(Path("slice.h5"), None, written=False))
 
 
 def _run(
@@ -206,8 +185,8 @@ def _run(
         title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
         write_whole(path.with_suffix(".csv"), table_of(slices, scores))
         write_whole(path, sweep_sheet(slices, scores, options, title))
-        best = None if scores is None else dict(slices[scores.best].values)
-        means = None if scores is None else scores.means.tolist()
+        best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
+        means = None if scores is None else scores.shares.tolist()
         sink(Done({"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means},
                   time=clock.now()))  # fmt: skip
     return slices, scores
@@ -228,6 +207,13 @@ def _remarks(
             "These values change the views that judge the slices: each is compared with the views of every value. "
             "One that all others contradict loses, and the middle of a range is favoured. Look at the pictures first."
         )
+    if scores.best is None:
+        low, high = scores.shares.min(), scores.shares.max()
+        remarks.append(
+            f"The residual of views held out is {low:.4g} to {high:.4g}, nearly the same for all values: it names none "
+            "of them. Look at the pictures."
+        )
+        return remarks
     best = slices[scores.best].values
     for each in options if len(slices) == math.prod(len(each.values) for each in options) else ():
         ends = (each.values[0], each.values[-1]) if each.numbers and len(each.values) > 2 else ()
@@ -242,7 +228,7 @@ def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([*slices[0].values, "residual_held_out", "verdict", "seconds"])
     for n, each in enumerate(slices):
-        residual = "" if scores is None else f"{scores.means[n]:.6g}"
+        residual = "" if scores is None else f"{scores.shares[n]:.6g}"
         writer.writerow([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
     return out.getvalue()
 
@@ -255,10 +241,10 @@ def _verdict(scores: Scores | None, n: int) -> str:
 
 def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     names = list(slices[0].values)
-    head = [*names, "residual of views held out", "", "s"]
+    head = [*names, METRICS["residual_held_out"].label, "", "s"]
     rows = [head]
     for n, each in enumerate(slices):
-        residual = "-" if scores is None else f"{scores.means[n]:.5g}"
+        residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
         rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
     widths = [max(len(row[at]) for row in rows) for at in range(len(head))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)

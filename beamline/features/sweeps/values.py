@@ -11,6 +11,7 @@ from decimal import Decimal
 from recon.base.registry import did_you_mean
 
 MOST = 64
+_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
 """Slices of a sheet."""
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):({_NUMBER})")
@@ -48,14 +49,17 @@ def swept_option(text: str, legal: Collection[str]) -> SweptOption:
     if not equals:
         raise ValueError(f"{text!r} is no option with values; expected NAME=A:B:STEP or NAME=a,b,c")
     if name not in legal:
-        near = did_you_mean(name, legal)
+        near = " (did you mean axis?)" if name in _AXIS else did_you_mean(name, legal)
         raise ValueError(
             f"{name!r} is no option of a slice{near}; those of `beamline recon --help-all` under Data, Corrections and "
             "Method can be swept, such as tv-weight, rings or axis"
         )
     tried = _values(name, values)
     if len(tried) < 2:
-        raise ValueError(f"{text!r} has {len(tried)} values; give at least two, as NAME=A:B:STEP or NAME=a,b,c")
+        one = f"; a single one is `beamline recon --{name} {tried[0]}`" if tried else ""
+        raise ValueError(
+            f"a sweep takes at least two values, as NAME=A:B:STEP or NAME=a,b,c, and {text!r} has {len(tried)}{one}"
+        )
     return SweptOption(name, tried)
 
 

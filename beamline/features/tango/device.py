@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,12 @@ import numpy as np
 
 from beamline.core.errors import BeamlineError, ConfigError, DataError, user_message
 from beamline.core.text import one_line
-from beamline.features.tango.followed_run import FollowedRun, Picture
-from beamline.features.tango.values import ScanAttributes
+from beamline.features.tango.served_run import SHOWN, Picture, ServedRun, device_state, quality
+from beamline.page.followed_run import PERIOD, StampedValues
 from beamline.page.tiles import MOST
 from beamline.scan.control import Verb
 from beamline.storage.hdf5 import NotReadyError
 
-PERIOD = 0.5  # s between two looks at the run
 _CLASS = "SplatlineScan"
 _CHECKS = 64  # of the monitor, at most
 _TYPES: dict[str, dict[str, Any]] = {
@@ -60,7 +59,7 @@ class ServerPlace:
         return f"tango://{self.address}:{self.port}/{self.device}#dbase=no"
 
 
-def device_class(run: FollowedRun, control: bool) -> type[Any]:
+def device_class(run: ServedRun, control: bool) -> type[Any]:
     """The class of the device.
 
     Args:
@@ -79,25 +78,25 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
 
     def reader(name: str) -> Callable[[Any], tuple[Any, float, Any]]:
         def read(device: Any) -> tuple[Any, float, Any]:
-            timed = run.timed
-            value = getattr(timed.values, name)
+            stamped = run.followed.stamped
+            value = getattr(stamped.values, name)
             value = list(value) if isinstance(value, tuple) else value
-            return value, timed.time(name), getattr(AttrQuality, timed.quality(name))
+            return value, stamped.stamp(name).time, getattr(AttrQuality, quality(stamped, name))
 
         return read
 
     def init_device(device: Any) -> None:
         Device.init_device(device)
-        for name in ("State", "Status", *(each.metadata["name"] for each in fields(ScanAttributes))):
+        for name in ("State", "Status", *(each.metadata["name"] for each in SHOWN)):
             device.set_change_event(name, True, False)
 
     body: dict[str, Any] = {
         "__doc__": "The newest run of a folder.",
         "init_device": init_device,
-        "dev_state": lambda device: getattr(DevState, run.timed.values.device_state),
+        "dev_state": lambda device: getattr(DevState, device_state(run.followed.stamped.values)),
         "dev_status": lambda device: status_of(run),
     }
-    for each in fields(ScanAttributes):
+    for each in SHOWN:
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
         body[each.metadata["name"]] = attribute(fget=reader(each.name), **facts)
     for name, taken, about in (
@@ -116,20 +115,20 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
     return type(_CLASS, (Device,), body)
 
 
-def _picture_reader(run: FollowedRun, taken: Callable[[], Picture]) -> Callable[[Any], tuple[Any, float, Any]]:
+def _picture_reader(run: ServedRun, taken: Callable[[], Picture]) -> Callable[[Any], tuple[Any, float, Any]]:
     """Reads a picture as an attribute; where there is no picture yet, its quality is invalid."""
     from tango import AttrQuality
 
     def read(device: Any) -> tuple[Any, float, Any]:
         try:
-            return taken(), run.timed.time("stored"), AttrQuality.ATTR_VALID
+            return taken(), run.followed.stamped.stamp("stored").time, AttrQuality.ATTR_VALID
         except (DataError, NotReadyError, OSError):
-            return np.zeros((1, 1), np.float32), run.timed.began, AttrQuality.ATTR_INVALID
+            return np.zeros((1, 1), np.float32), run.followed.stamped.began, AttrQuality.ATTR_INVALID
 
     return read
 
 
-def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
+def _sender(run: ServedRun, verb: Verb) -> Callable[[Any], None]:
     """The command of the device that sends a verb to the run."""
     from tango import Except
 
@@ -144,9 +143,9 @@ def _sender(run: FollowedRun, verb: Verb) -> Callable[[Any], None]:
     return send
 
 
-def status_of(run: FollowedRun) -> str:
+def status_of(run: ServedRun) -> str:
     """The state and the last message of the scan, and why it did not do the last verb."""
-    values = run.timed.values
+    values = run.followed.stamped.values
     return one_line("; ".join(filter(None, (values.state, values.message, run.refused))), 1000)
 
 
@@ -162,13 +161,13 @@ def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], No
         ConfigError: pytango is not installed.
         DataError: the address cannot be listened at, or the database does not answer.
     """
-    with closing(FollowedRun(runs, say)) as run:
+    with closing(ServedRun(runs, say)) as run:
         served = device_class(run, control)
         import tango
         from tango.server import run as run_server
 
         def look() -> bool:
-            before, now = run.timed, run.look()
+            before, now = run.followed.stamped, run.look()
             for device in tango.Util.instance().get_device_list_by_class(_CLASS):
                 with tango.AutoTangoMonitor(device):
                     push_changes(device, before, now)
@@ -193,19 +192,19 @@ def serve(runs: Path, place: ServerPlace, control: bool, say: Callable[[str], No
             raise DataError(f"{place} cannot be served: {one_line(why, 300)}. Nothing was started.") from error
 
 
-def push_changes(device: Any, before: Any, now: Any) -> None:
+def push_changes(device: Any, before: StampedValues, now: StampedValues) -> None:
     """Tell clients that wait for changes of each value that was set again."""
     from tango import AttrQuality, DevState
 
-    for each in fields(ScanAttributes):
+    for each in SHOWN:
         name = each.name
         value, known = getattr(now.values, name), getattr(before.values, name)
         same = value == known or (value != value and known != known)  # NaN is not equal to itself
-        if same and now.time(name) == before.time(name) and now.quality(name) == before.quality(name):
+        at, how = now.stamp(name).time, quality(now, name)
+        if same and (at, how) == (before.stamp(name).time, quality(before, name)):
             continue
-        quality = getattr(AttrQuality, now.quality(name))
         value = list(value) if isinstance(value, tuple) else value
-        device.push_change_event(each.metadata["name"], value, now.time(name), quality)
-    if now.values.device_state != before.values.device_state:
-        device.push_change_event("State", getattr(DevState, now.values.device_state), math.floor(time.time()),
+        device.push_change_event(each.metadata["name"], value, at, getattr(AttrQuality, how))
+    if (state := device_state(now.values)) != device_state(before.values):
+        device.push_change_event("State", getattr(DevState, state), math.floor(time.time()),
                                  AttrQuality.ATTR_VALID)  # fmt: skip

@@ -20,7 +20,7 @@ from beamline.core.need import Need
 from beamline.core.sinks import Warn, Warnings
 from beamline.core.text import count, size
 from beamline.features.trials.data import TrialData
-from beamline.features.trials.plans import expected_span
+from beamline.features.trials.plans import expected_seconds
 from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import Trial
 from drivers.base.clock import SystemClock
@@ -104,9 +104,10 @@ def dry_run(
     if planned.reference is not None:
         trials = [planned.reference, *trials]
 
+    at_most = expected_seconds(data.geometry, rates)
+
     def expected(trial: Trial) -> ExpectedTrial:
-        span = expected_span(trial, data.geometry, rates)
-        seconds = None if span is None else start + span.most
+        seconds = None if (works := at_most(trial)) is None else start + works
         return ExpectedTrial(label=trial.label, seconds=seconds, memory=_memory(trial, data, own_bytes))
 
     free = shutil.disk_usage(folder.absolute().parent).free
@@ -127,9 +128,12 @@ def _memory(trial: Trial, data: TrialData, own_bytes: int) -> int:
     """Bytes: of a process that has loaded the libraries, the views twice (in their file and those used), the rest."""
     method = trial.build()
     coarse = data.geometry.binned(trial.binning)
-    return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), data.weights is not None)
+    weighted = data.prepared.ray_factors() is not None
+    return own_bytes + 2 * _bytes(data) + method.memory(coarse, Grid.matching(coarse), weighted)
 
 
 def _bytes(data: TrialData) -> int:
-    arrays = (data.projections, data.weights, data.truth, data.held_out and data.held_out[0])
+    prepared = data.prepared
+    known, unseen = prepared.projections, prepared.held_out
+    arrays = (known.data, known.weights, prepared.shares, data.truth, unseen and unseen[0])
     return sum(array.nbytes for array in arrays if array is not None)

@@ -10,7 +10,7 @@ from typing import Any
 
 from beamline.features.trials import pareto
 from beamline.features.trials.figures import cost_curves, pareto_plot
-from beamline.features.trials.layout import TableColumn
+from beamline.features.trials.layout import TableColumn, TableLayout
 from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.projections.scan_statistics import Light
@@ -45,7 +45,7 @@ _FIGURES = {
     "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", _digits("spillover")),
     "variation": _Figure("noise", "noise", "standard deviation of the body over its level", _digits("variation")),
     "residual_held_out": _Figure(
-        "held out", "held-out res.", "residual of views held out", _digits("residual_held_out")
+        "held out", "held-out res.", METRICS["residual_held_out"].label, _digits("residual_held_out")
     ),
     "resolution": _Figure("FSC", "FSC ({})", "period in {} to which two halves of the views agree", _period),
 }
@@ -58,90 +58,73 @@ _FSC = (
 )
 
 
-@dataclass(frozen=True)
-class TradeoffLayout:
-    """The table of a trade-off, whose rows on the front of time and quality stand out."""
+def _columns(table: TrialTable) -> Sequence[TableColumn]:
+    settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
+    return [
+        *(TableColumn(name, _of_trial(name)) for name in ("group", "method", "views", "binning")),
+        *(TableColumn(name, partial(_setting, name)) for name in settings),
+        TableColumn("status", lambda o: o.status),
+        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
+        TableColumn("seconds", lambda o: o.seconds, "s", "s", shown=lambda o: _time(o.seconds)),
+        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: _time(o.cpu_seconds)),
+        TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0, lambda o: o.reached),
+        TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, _megabytes),
+        TableColumn("gaussians_end", lambda o: o.gaussians),
+        *dose_columns(table),
+        *(_figure(name, table.length_unit) for name in _names(table)),
+        TableColumn("quality_db", lambda o: o.quality(table.by)),
+        TableColumn("message", lambda o: o.message),
+    ]
 
-    name: str = "tradeoff"
-    page: str = "tradeoff.html"
-    unit: str = "trials"
-    title: str = "What accuracy costs"
-    question: str = ""
 
-    def labels(self, outcome: Outcome) -> tuple[str, ...]:
-        return (outcome.trial.label,)
+def _marked(table: TrialTable) -> set[int]:
+    best = {id(table.compared[i]) for i in table.front(TIME)}
+    return {n for n, outcome in enumerate(table.outcomes) if id(outcome) in best}
 
-    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
-        settings = list(dict.fromkeys(name for outcome in table.outcomes for name in outcome.trial.settings))
-        return [
-            *(TableColumn(name, _of_trial(name)) for name in ("group", "method", "views", "binning")),
-            *(TableColumn(name, partial(_setting, name)) for name in settings),
-            TableColumn("status", lambda o: o.status),
-            TableColumn("seconds_asked", lambda o: o.trial.seconds_asked),
-            TableColumn("seconds", lambda o: o.seconds, "s", "s", shown=lambda o: _time(o.seconds)),
-            TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: _time(o.cpu_seconds)),
-            TableColumn("reached", lambda o: o.reached, "reached" * table.timed, "reached", 0, lambda o: o.reached),
-            TableColumn("peak_bytes", lambda o: o.peak_bytes, "MB", "MB", 6, _megabytes),
-            TableColumn("gaussians_end", lambda o: o.gaussians),
-            *dose_columns(table),
-            *(_figure(name, table.length_unit) for name in _names(table)),
-            TableColumn("quality_db", lambda o: o.quality(table.by)),
-            TableColumn("message", lambda o: o.message),
-        ]
 
-    def marked(self, table: TrialTable) -> set[int]:
-        best = {id(table.compared[i]) for i in table.front(TIME)}
-        return {n for n, outcome in enumerate(table.outcomes) if id(outcome) in best}
+def _legend(table: TrialTable) -> Sequence[str]:
+    figures = [_FIGURES[name] for name in _names(table)]
+    words = "; ".join(f"{each.short}: {each.legend.format(table.length_unit)}" for each in figures)
+    return [*([f"{words}."] if words else []), "*: on the front of time and quality."]
 
-    def legend(self, table: TrialTable) -> Sequence[str]:
-        figures = [_FIGURES[name] for name in _names(table)]
-        words = "; ".join(f"{each.short}: {each.legend.format(table.length_unit)}" for each in figures)
-        return [*([f"{words}."] if words else []), "*: on the front of time and quality."]
 
-    def sentences(self, table: TrialTable) -> Sequence[str]:
-        return conclusions(table)
+def _record(table: TrialTable) -> Mapping[str, Any]:
+    return {
+        "quality": table.by,
+        "length_unit": table.length_unit,
+        "trials": [outcome.as_record() for outcome in table.outcomes],
+        "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
+        "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
+    }
 
-    def record(self, table: TrialTable) -> Mapping[str, Any]:
-        return {
-            "quality": table.by,
-            "length_unit": table.length_unit,
-            "trials": [outcome.as_record() for outcome in table.outcomes],
-            "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
-            "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
-        }
 
-    def pictures(self, table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
-        """Quality against each cost, curves, and slices of each baseline and of the truth."""
-        pictures = []
-        doses = [table.dose] if len({outcome.trial.views for outcome in table.compared}) > 1 else []
-        for cost in (TIME, MEMORY, *doses):
-            if table.front(cost):
-                caption = (
-                    f"{table.quality.words} of every trial against its {cost.words}. The line is the best quality "
-                    "at each cost; its corners are the trials that no other beats in both."
-                )
-                picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
-                pictures.append((f"quality_{cost.name}.png", picture))
-        curves = [o for o in table.compared if o.trial.group == "method" and len(o.curve) > 1]
-        if curves:
+def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
+    """Quality against each cost, curves, and slices of each baseline and of the truth."""
+    pictures = []
+    doses = [table.dose] if len({outcome.trial.views for outcome in table.compared}) > 1 else []
+    for cost in (TIME, MEMORY, *doses):
+        if table.front(cost):
             caption = (
-                "−20 log₁₀ of the residual that each baseline recorded during its run. Solid: views held out. Dashed: "
-                "views used; this residual still falls when the volume already fits their noise. A fit's residual is "
-                "that of its Gaussians, which may lie between voxels and outside the volume; the table judges the "
-                "volume."
+                f"{table.quality.words} of every trial against its {cost.words}. The line is the best quality "
+                "at each cost; its corners are the trials that no other beats in both."
             )
-            pictures.append(
-                ("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves)))
-            )
-        if labels := slices.labels():
-            caption = "The same slice by each method with its usual settings, all in the grey window of the first."
-            if any(outcome.trial.several for outcome in table.outcomes):
-                caption += " Of several volumes, the one that the middle view shows, by its time or energy."
-            pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
-        return pictures
-
-
-TRADEOFF = TradeoffLayout()
+            picture = Picture(f"Quality against {cost.words}", caption, _pareto(table, cost))
+            pictures.append((f"quality_{cost.name}.png", picture))
+    curves = [o for o in table.compared if o.trial.group == "method" and len(o.curve) > 1]
+    if curves:
+        caption = (
+            "−20 log₁₀ of the residual that each baseline recorded during its run. Solid: views held out. Dashed: "
+            "views used; this residual still falls when the volume already fits their noise. A fit's residual is "
+            "that of its Gaussians, which may lie between voxels and outside the volume; the table judges the "
+            "volume."
+        )
+        pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
+    if labels := slices.labels():
+        caption = "The same slice by each method with its usual settings, all in the grey window of the first."
+        if any(outcome.trial.several for outcome in table.outcomes):
+            caption += " Of several volumes, the one that the middle view shows, by its time or energy."
+        pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
+    return pictures
 
 
 def dose_columns(table: TrialTable) -> list[TableColumn]:
@@ -259,3 +242,10 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
         cost.unit,
         worth_its_time(table) if cost is TIME else None,
     )
+
+
+TRADEOFF = TableLayout(
+    "tradeoff", "tradeoff.html", "trials", "What accuracy costs", lambda outcome: (outcome.trial.label,), _columns,
+    conclusions, _record, _pictures, marked=_marked, legend=_legend,
+)  # fmt: skip
+"""The table of a trade-off, whose rows on the front of time and quality stand out."""

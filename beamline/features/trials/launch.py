@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+import pickle
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +19,24 @@ DATA = "data"
 """Name of the folder with the `TrialData` that all trials read, in the folder of the results."""
 
 
+@dataclass(frozen=True)
+class TrialJob:
+    """What a process is to do.
+
+    Attributes:
+        data: folder of `TrialData`.
+        trial: to run; None: only kernels are compiled.
+        keep: a .npy file for the volume [z, y, x]; None: it is measured and forgotten.
+        compiled: trials whose kernels are compiled.
+    """
+
+    data: Path
+    trial: Trial | None = None
+    seed: int = 0
+    keep: Path | None = None
+    compiled: Sequence[Trial] = ()
+
+
 def command(job: Path) -> Sequence[str]:
     """The command that runs the job in the file `job`."""
     return [sys.executable, "-m", "beamline.features.trials.worker", str(job)]
@@ -32,7 +50,7 @@ def compile_kernels(trials: Sequence[Trial], work: Path, max_seconds: float | No
         max_seconds: after which it is ended; what is missing is compiled by the trials. None: no limit.
     """
     kinds = {_kernels(trial): trial for trial in trials}
-    job = {"data": str(work / DATA), "compile": [trial.as_job() for trial in kinds.values()]}
+    job = TrialJob(work / DATA, compiled=tuple(kinds.values()))
     _run(job, work, max_seconds)  # a failure here comes again in a trial, which reports it
 
 
@@ -54,8 +72,7 @@ def run_trial(
     Raises:
         DataError: the disk did not take the job or the volume: trials to come would fail, too.
     """
-    job = {"data": str(work / DATA), "trial": trial.as_job(), "seed": seed, "keep": keep and str(keep)}
-    return _outcome(trial, _run(job, work, max_seconds))
+    return _outcome(trial, _run(TrialJob(work / DATA, trial, seed, keep), work, max_seconds))
 
 
 @dataclass(frozen=True)
@@ -69,10 +86,10 @@ class _Ended:
     out_of_time: bool
 
 
-def _run(job: Mapping[str, Any], work: Path, max_seconds: float | None = None) -> _Ended:
-    path, log = work / "job.json", work / "stderr.txt"
+def _run(job: TrialJob, work: Path, max_seconds: float | None = None) -> _Ended:
+    path, log = work / "job.pickle", work / "stderr.txt"
     with named_on_failure(path):
-        path.write_text(json.dumps(job), encoding="utf-8")
+        path.write_bytes(pickle.dumps(job))
     last: dict[str, Any] = {}
 
     def remember(line: str) -> None:

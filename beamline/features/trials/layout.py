@@ -6,11 +6,11 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Protocol
+from typing import Any
 
 from beamline.core.events import TrialDone
 from beamline.core.files import write_whole
@@ -22,10 +22,6 @@ from beamline.report.html import Picture, render
 from beamline.report.slice_sheet import SliceSheet
 
 _WIDTH = 120  # characters
-
-
-def _nothing(outcome: Outcome) -> str:
-    return ""
 
 
 @dataclass(frozen=True)
@@ -46,54 +42,41 @@ class TableColumn:
     heading: str = ""
     short: str = ""
     width: int = 8
-    shown: Callable[[Outcome], str] = _nothing
+    shown: Callable[[Outcome], str] = lambda outcome: ""
     metric: bool = False
 
 
-class TableLayout(Protocol):
+@dataclass(frozen=True)
+class TableLayout:
     """What a table compares, and how it is written.
 
     Attributes:
         name: in events and messages, and of the files NAME.csv and NAME.json.
         page: file name of the page.
         unit: what its rows are.
+        title: of the page.
+        labels: the first cells of a row.
+        columns: all others.
+        sentences: what follows from the table, and what its figures mean.
+        record: what JSON has beside the scan, the machine and the command.
+        pictures: those that have data, by file name.
+        question: that the table answers; empty: none in words.
+        marked: numbers of the rows that stand out, see `TrialTable.outcomes`.
+        legend: sentences that explain short headings and the mark *.
     """
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def page(self) -> str: ...
-    @property
-    def unit(self) -> str: ...
-
-    @property
-    def title(self) -> str:
-        """Of the page."""
-
-    @property
-    def question(self) -> str:
-        """That the table answers; empty: none in words."""
-
-    def labels(self, outcome: Outcome) -> tuple[str, ...]:
-        """The first cells of a row."""
-
-    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
-        """All others."""
-
-    def marked(self, table: TrialTable) -> set[int]:
-        """Numbers of the rows that stand out, see `TrialTable.outcomes`."""
-
-    def legend(self, table: TrialTable) -> Sequence[str]:
-        """Sentences that explain short headings and the mark *."""
-
-    def sentences(self, table: TrialTable) -> Sequence[str]:
-        """What follows from the table, and what its figures mean."""
-
-    def record(self, table: TrialTable) -> Mapping[str, Any]:
-        """What JSON has beside the scan, the machine and the command."""
-
-    def pictures(self, table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
-        """By file name; those that have data."""
+    name: str
+    page: str
+    unit: str
+    title: str
+    labels: Callable[[Outcome], tuple[str, ...]]
+    columns: Callable[[TrialTable], Sequence[TableColumn]]
+    sentences: Callable[[TrialTable], Sequence[str]]
+    record: Callable[[TrialTable], Mapping[str, Any]]
+    pictures: Callable[[TrialTable, SliceSheet], Sequence[tuple[str, Picture]]]
+    question: str = ""
+    marked: Callable[[TrialTable], Collection[int]] = lambda table: ()
+    legend: Callable[[TrialTable], Sequence[str]] = lambda table: ()
 
 
 def status_text(outcome: Outcome) -> str:
@@ -167,7 +150,7 @@ def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: Sli
 
 
 def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture]) -> str:
-    """The page."""
+    """The table and its pictures as an HTML page."""
     columns, marked = [column for column in layout.columns(table) if column.heading], layout.marked(table)
     counts = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(

@@ -1,6 +1,6 @@
 """Plans: which settings of each method a trade-off tries, in which order, and how long the rest will take.
 
-A method without a line in `TRIALS` is tried with its defaults.
+The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
 """
 
 from __future__ import annotations
@@ -9,35 +9,31 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal
+from functools import cache
+from typing import Literal
 
 import numpy as np
 
-from beamline.core.machine_speed import seconds_left
 from beamline.features.trials.trial import Outcome, Trial
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import Method, Plain, volumes_of
+from recon.base.method import Plain
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, seconds_of
-from recon.methods import by_name
-from recon.splatting.fit_method import FitMethod
-from recon.splatting.gaussians import Gaussians
+from recon.methods import METHODS, by_name, has_setting
+from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
+Expected = Callable[[Trial], float | None]
+"""s of a trial; None: not known."""
 
 _WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
-_WORK_OF_MOTION: Mapping[Any, int] = {False: 2, True: 3, None: 5}
-"""A rough measure of the work of a series by its `moves`. Views held out choose in a trial of each."""
 _LEAST_OF_PART = 6  # views
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
-_PUBLISHED_STEPS = {"quick": (1000,), "full": (3000, 10_000)}
-_FIELD_STEPS = {"quick": (300,), "full": (1000, 3000)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
@@ -63,34 +59,13 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
         gaussians: how many a fit starts from by default.
         depth: "quick" has fewer trials, and shorter ones.
     """
-    return TRIALS.get(method, _baseline)(gaussians, depth)
-
-
-def work_of(method: Method, n_views: int, binning: int) -> float:
-    """A rough measure of the time that a run takes, to be compared within one method only."""
-    if isinstance(method, FitMethod):
-        count = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians or 0
-        spread = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
-        return (method.planned_steps or 0) * (1 + count / 2e4 * spread**2)
-    return n_views * (getattr(method, "iterations", None) or 1) / binning**3
-
-
-def _baseline(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    return [TrialSettings("method")]
-
-
-def _iterations(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """Numbers of iterations: the middle one is the baseline."""
-    numbers = {"quick": quick, "full": full}[depth]
-    base = numbers[len(numbers) // 2]
-    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
-    return [TrialSettings("method", {"iterations": base}), *others]
-
-
-def _beside_chosen(quick: Sequence[int], full: Sequence[int], gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """Numbers of iterations beside the one that the data choose, the baseline."""
-    numbers = {"quick": quick, "full": full}[depth]
-    return [TrialSettings("method"), *(TrialSettings("iterations", {"iterations": n}) for n in numbers)]
+    if (lengths := METHODS[method].lengths) is None:
+        return _fits(gaussians, depth) if issubclass(by_name(method), R2) else [TrialSettings("method")]
+    tried: Sequence[int] = getattr(lengths, depth)
+    fixed: dict[str, Plain] = {"gaussians": gaussians} if has_setting(by_name(method), "gaussians") else {}
+    settings = [{lengths.setting: length, **fixed} for length in tried]
+    base, *others = [{}, *settings] if lengths.chosen else settings
+    return [TrialSettings("method", base), *(TrialSettings(lengths.setting, each) for each in others)]
 
 
 def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
@@ -113,35 +88,8 @@ def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     return settings
 
 
-def _fields(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    base, *longer = ({"steps": steps} for steps in _FIELD_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
-
-
-def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
-    """The published fit in fewer than its 30 000 steps, which would take a trade-off hours."""
-    base, *longer = ({"steps": steps, "gaussians": gaussians} for steps in _PUBLISHED_STEPS[depth])
-    return [TrialSettings("method", base), *(TrialSettings("steps", settings) for settings in longer)]
-
-
-TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
-    "r2": _fits,
-    "r2-published": _published,
-    **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
-    "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
-    "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
-    "osem": partial(_beside_chosen, (3, 12), (1, 3, 6, 12, 50)),
-    "mlem": partial(_beside_chosen, (12, 50), (4, 12, 24, 50, 200)),
-    "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
-    "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
-    "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),
-    "os-sirt-tv": partial(_iterations, (5, 15), (5, 10, 20, 40)),
-    "pnp-dct": partial(_iterations, (35,), (15, 35, 70)),
-}
-
-
 def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:
-    """The trials, one setting varied at a time about each method's baseline; baselines first, cheap ones early.
+    """The trials, one setting varied at a time about each method's baseline; baselines first.
 
     Args:
         methods: names in `recon.methods`, in the order wanted.
@@ -162,7 +110,17 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
         first.append(replace(base, halves=True))
         rest += [replace(base, group="views", views=n) for n in counts]
         rest += others
-    return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
+    return tuple(dict.fromkeys([*first, *rest]))
+
+
+def quick_first(trials: Sequence[Trial], expected: Expected) -> tuple[Trial, ...]:
+    """The trials with baselines first, then those that take least time, and those whose time is not known."""
+
+    def order(trial: Trial) -> tuple[bool, float]:
+        varied = trial.group != "method"
+        return varied, (expected(trial) or math.inf) if varied else 0.0
+
+    return tuple(sorted(trials, key=order))
 
 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
@@ -185,7 +143,7 @@ def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: 
     """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
     alone = _baselines(methods, n_views, gaussians)
     numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
-    settings: list[dict[str, Plain | None]] = [{"volumes": volumes, "moves": moves} for moves in _WORK_OF_MOTION]
+    settings: list[dict[str, Plain | None]] = [{"volumes": volumes, "moves": moves} for moves in (False, True, None)]
     jointly = [Trial("one fit", "series", n_views, settings=each) for each in settings]
     return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *jointly
 
@@ -210,15 +168,6 @@ def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Tri
     ]
 
 
-def work(trial: Trial) -> float:
-    """A rough number for how long a trial takes, to be compared within one method only."""
-    method = trial.build()
-    if method.traits.several:
-        of_motion, share = _WORK_OF_MOTION[trial.settings.get("moves", False)], "states" in trial.settings
-        return float(trial.views * volumes_of(method) * of_motion * (1 + share))
-    return work_of(method, trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
-
-
 @dataclass(frozen=True)
 class Timed:
     """A trial that is done, and where its time went.
@@ -239,14 +188,19 @@ class Timed:
         return cls(outcome.trial, wall, min(wall, seconds) if math.isfinite(seconds) else 0.0)
 
 
-def expected_span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
-    """s that a trial on some of these views reconstructs.
+def expected_seconds(geometry: Geometry, rates: Rates) -> Expected:
+    """s that a trial on some of these views reconstructs, at most.
 
     None: not known before it is tried; that is also where its method refuses the views, which the trial will report.
     """
-    with suppress(ValueError):
-        return _span(trial, geometry, rates)
-    return None
+
+    @cache
+    def of_trial(trial: Trial) -> float | None:
+        with suppress(ValueError):
+            return None if (span := _span(trial, geometry, rates)) is None else span.most
+        return None
+
+    return of_trial
 
 
 def _span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
@@ -266,43 +220,29 @@ def _span(trial: Trial, geometry: Geometry, rates: Rates) -> Span | None:
     return Span(*(min(limit, sum(ends)) for ends in zip(*spans, strict=True)))
 
 
-def trials_left(
-    done: Sequence[Timed], trials: Sequence[Trial], expected: Callable[[Trial], float | None] = lambda trial: None
-) -> float | None:
+def trials_left(done: Sequence[Timed], trials: Sequence[Trial], expected: Expected) -> float | None:
     """s that the trials to come will take, from those done; None before the first.
 
-    Each takes the same time to start and measure, and what is expected of it, at the pace of the trials that are done.
-    Where nothing is expected of a trial, it takes what those of its method did by their work, or what all did.
-
-    Args:
-        expected: s of a trial; None: not known.
+    Each takes the same time to start and measure, and what is expected of it, at the pace of its method's trials that
+    are done, or of all. One of which nothing is expected takes what those of its method did, or all.
     """
     if not done:
         return None
-    fixed = sum(each.wall - each.working for each in done) / len(done)
-    told = [
-        (seconds, each.working)
-        for each in done
-        if each.working > 0 and not each.trial.direct and (seconds := expected(each.trial))
-    ]  # a direct method is over too soon to tell how fast this machine is
-    amount, spent = (sum(values) for values in zip(*told, strict=True)) if told else (1.0, 1.0)
-    total = 0.0
+    total = len(trials) * sum(each.wall - each.working for each in done) / len(done)
+    # a direct method is over too soon to tell how fast this machine is
+    pace = _pace([each for each in done if not each.trial.direct], expected) or 1.0
     for trial in trials:
-        total += fixed
         same = [each for each in done if each.trial.method == trial.method and each.working > 0]
         if trial.seconds_asked is not None:
             total += trial.seconds_asked
-        elif same:
-            shares = [_share(each.trial, trial, expected) for each in same]
-            total += seconds_left(sum(shares), sum(shares) + 1, sum(each.working for each in same)) or 0.0
         elif (seconds := expected(trial)) is not None:
-            total += seconds * spent / amount
+            total += seconds * (_pace(same, expected) or pace)
         else:
-            total += sum(each.working for each in done) / len(done)
+            total += sum(each.working for each in same or done) / len(same or done)
     return total
 
 
-def _share(done: Trial, trial: Trial, expected: Callable[[Trial], float | None]) -> float:
-    """What a trial took of the time of another one of the same method: as expected, else by their work."""
-    of_done, of_trial = expected(done), expected(trial)
-    return of_done / of_trial if of_done and of_trial else work(done) / work(trial)
+def _pace(done: Sequence[Timed], expected: Expected) -> float | None:
+    """What trials took over what was expected of them; None where nothing was."""
+    told = [(seconds, each.working) for each in done if each.working > 0 and (seconds := expected(each.trial))]
+    return sum(taken for _, taken in told) / sum(seconds for seconds, _ in told) if told else None

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.data import TrialData, write_array
 from beamline.features.trials.launch import DATA, compile_kernels, run_trial
 from beamline.features.trials.layout import TableLayout, event_of, write_page, write_table
-from beamline.features.trials.plans import Timed, expected_span, trials_left
+from beamline.features.trials.plans import Expected, Timed, expected_seconds, trials_left
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.prepare import prepare_projections
@@ -35,7 +34,6 @@ from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32
-from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import Rates
 
@@ -79,7 +77,7 @@ class OpenedScan:
 
 
 def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
-    """Read and correct the views. What is refused is refused first.
+    """Read and correct the views, after all inputs were checked.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -88,7 +86,7 @@ def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         light, facts = light_in(source, asked.light), dict(facts_of(source).table)
-        prepared = prepare_projections(source, asked.selection, warn)
+        prepared = prepare_projections(source, asked.selection, warn).without_warnings
     grid = Grid.matching(prepared.geometry)
     truth = None if truth_given is None else fit_truth(truth_given, grid, asked.selection.binning).data
     facts["volume"] = " × ".join(map(str, grid.shape))
@@ -136,7 +134,6 @@ class _Rig:
     Attributes:
         work: folder with the data.
         end: by `now`, when the last trial must be done; inf: no limit.
-        expected: s of a trial; None: not known.
     """
 
     work: Path
@@ -144,7 +141,7 @@ class _Rig:
     end: float
     now: Callable[[], float]
     emit: Callable[[Event], None]
-    expected: Callable[[Trial], float | None]
+    expected: Expected
 
     @property
     def seconds(self) -> float | None:
@@ -195,7 +192,7 @@ def run_comparison(
     data, planned = plan(Warnings(sink, clock))
     emit(planned.started)
     table, layout, slices, truth = planned.table, planned.layout, SliceSheet(), data.truth
-    expected = _expected(data.geometry, rates or MachineSpeed())
+    expected = expected_seconds(data.geometry, rates or MachineSpeed())
     with _result_folder(folder) as work:
         data.save(work / DATA)
         del data
@@ -215,17 +212,6 @@ def run_comparison(
     summary = {"output": folder, layout.unit: len(table.todo), "done": table.n_done, "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
-
-
-def _expected(geometry: Geometry, rates: Rates) -> Callable[[Trial], float | None]:
-    """s of a trial, on this machine; None: not known."""
-
-    @cache
-    def of_trial(trial: Trial) -> float | None:
-        span = expected_span(trial, geometry, rates)
-        return None if span is None else span.most
-
-    return of_trial
 
 
 def _usable(max_seconds: float) -> float:

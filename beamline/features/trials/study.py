@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from beamline.core.sinks import Warn
 from beamline.features.trials.data import TrialData
 from beamline.features.trials.figures import against_cost, figures_of_rows
 from beamline.features.trials.front import dose_columns
-from beamline.features.trials.layout import TableColumn, records
+from beamline.features.trials.layout import TableColumn, TableLayout, records
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
@@ -103,9 +102,9 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
     reference = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
-    data = TrialData(prepared.projections.data, geometry, None, opened.truth, prepared.rays_there(), prepared.emission)
+    data = TrialData(replace(prepared, held_out=None), opened.truth)
     started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
-    return data, Planned(table, StudyLayout(options.study), started, reference)
+    return data, Planned(table, layout_of(options.study), started, reference)
 
 
 def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
@@ -132,75 +131,52 @@ def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
     return notes
 
 
-@dataclass(frozen=True)
-class StudyLayout:
+def layout_of(study: Study) -> TableLayout:
     """The table of a study: a row for each choice of views and method."""
+    return TableLayout(
+        "study", REPORT, "rows", study.title, lambda outcome: (_choice(outcome).label, outcome.trial.method), _columns,
+        lambda table: [*draws(table), *table.notes],
+        lambda table: {"study": study.name, "notes": list(table.notes), "rows": records(table, layout_of(study))},
+        _pictures, study.question,
+    )  # fmt: skip
 
-    study: Study
-    name: str = "study"
-    page: str = REPORT
-    unit: str = "rows"
 
-    @property
-    def title(self) -> str:
-        return self.study.title
+def _columns(table: TrialTable) -> Sequence[TableColumn]:
+    timed, shown = table.timed, names(table)
+    return [
+        TableColumn("row", lambda o: _choice(o).label),
+        TableColumn("method", lambda o: o.trial.method),
+        TableColumn("views", lambda o: o.trial.views),
+        TableColumn("window", lambda o: _choice(o).window),
+        TableColumn("frames", lambda o: o.trial.frames),
+        *dose_columns(table),
+        TableColumn("status", lambda o: o.status),
+        TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
+        TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
+        TableColumn("cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"),
+        TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
+        *(_figure(name, name in shown) for name in _FIGURES),
+        TableColumn("message", lambda o: o.message),
+    ]
 
-    @property
-    def question(self) -> str:
-        return self.study.question
 
-    def labels(self, outcome: Outcome) -> tuple[str, ...]:
-        return _choice(outcome).label, outcome.trial.method
-
-    def columns(self, table: TrialTable) -> Sequence[TableColumn]:
-        timed, shown = table.timed, names(table)
-        return [
-            TableColumn("row", lambda o: _choice(o).label),
-            TableColumn("method", lambda o: o.trial.method),
-            TableColumn("views", lambda o: o.trial.views),
-            TableColumn("window", lambda o: _choice(o).window),
-            TableColumn("frames", lambda o: o.trial.frames),
-            *dose_columns(table),
-            TableColumn("status", lambda o: o.status),
-            TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
-            TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
-            TableColumn(
-                "cpu_seconds", lambda o: o.cpu_seconds, "CPU s", "CPU s", shown=lambda o: f"{o.cpu_seconds:.1f}"
-            ),
-            TableColumn("reached", lambda o: o.reached, "reached" * timed, "reached", 0, lambda o: o.reached),
-            *(_figure(name, name in shown) for name in _FIGURES),
-            TableColumn("message", lambda o: o.message),
-        ]
-
-    def marked(self, table: TrialTable) -> set[int]:
-        return set()
-
-    def legend(self, table: TrialTable) -> Sequence[str]:
-        return []
-
-    def sentences(self, table: TrialTable) -> Sequence[str]:
-        return [*draws(table), *table.notes]
-
-    def record(self, table: TrialTable) -> Mapping[str, Any]:
-        return {"study": self.study.name, "notes": list(table.notes), "rows": records(table, self)}
-
-    def pictures(self, table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
-        pictures, figures = [], names(table)
-        if table.compared:
-            caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
-            axes = {name: _FIGURES[name][0] + " (dB)" * bool(_metric(name).unit) for name in figures}
-            picture = figures_of_rows(table, {axes[name]: partial(value_of, name) for name in figures})
-            pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
-            first = "psnr_truth" if "psnr_truth" in figures else figures[0]
-            caption = "Each frame of the scan has the same dose; one that several views share is counted once."
-            picture = against_cost(table, axes[first], partial(value_of, first))
-            pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
-        for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
-            caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
-            picture = slices.png(slices.labels(method))
-            title = f"{by_name(method).label}, slice by slice"
-            pictures.append((f"slices_{method}.png", Picture(title, caption, picture)))
-        return pictures
+def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Picture]]:
+    pictures, figures = [], names(table)
+    if table.compared:
+        caption = "What each figure is of is said above. A smoother volume has more SNR and CNR."
+        axes = {name: _FIGURES[name][0] + " (dB)" * bool(_metric(name).unit) for name in figures}
+        picture = figures_of_rows(table, {axes[name]: partial(value_of, name) for name in figures})
+        pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
+        first = "psnr_truth" if "psnr_truth" in figures else figures[0]
+        caption = "Each frame of the scan has the same dose; one that several views share is counted once."
+        picture = against_cost(table, axes[first], partial(value_of, first))
+        pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
+    for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
+        caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
+        picture = slices.png(slices.labels(method))
+        title = f"{by_name(method).label}, slice by slice"
+        pictures.append((f"slices_{method}.png", Picture(title, caption, picture)))
+    return pictures
 
 
 def _choice(outcome: Outcome) -> ViewChoice:

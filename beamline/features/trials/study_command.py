@@ -15,6 +15,7 @@ from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import (
     MethodChoice,
     NameChoice,
+    WholeRange,
     dry_option,
     json_option,
     new_folder_option,
@@ -72,7 +73,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=click.IntRange(min=1, max=100),
+        type=WholeRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",
@@ -101,7 +102,7 @@ def study(request: StudyRequest) -> None:
     """
     from beamline.features.trials.layout import text
     from beamline.features.trials.runner import ComparedScan
-    from beamline.features.trials.study import StudyLayout, StudyOptions, planned_study, run_study
+    from beamline.features.trials.study import StudyOptions, layout_of, planned_study, run_study
 
     methods = tuple(dict.fromkeys(request.methods))
     context = click.get_current_context()
@@ -134,7 +135,7 @@ def study(request: StudyRequest) -> None:
     with events_shown(request.as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not request.as_json:
-        click.echo(text(table, StudyLayout(STUDIES[request.which])))
+        click.echo(text(table, layout_of(STUDIES[request.which])))
         click.echo(f"\n{'report':<10}{folder / REPORT}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.todo)}"

@@ -13,22 +13,25 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Sink, TradeoffStarted
 from beamline.core.files import refuse_existing
 from beamline.core.machine import machine
+from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.energies.scans import EnergyScans, prepare_energies, views_of
 from beamline.features.trials.data import TrialData
 from beamline.features.trials.front import TRADEOFF
 from beamline.features.trials.plans import (
     Depth,
+    expected_seconds,
     plan,
     plan_in_equal_time,
     plan_in_time,
     plan_of_energies,
+    quick_first,
     telling_first,
 )
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.projections.held_out import hold_out
+from beamline.projections.held_out import hold_out, with_views_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import Light
 from beamline.reconstruct.outcome import facts_of
@@ -125,9 +128,11 @@ def _of_one_volume(options: TradeoffOptions, warn: Warn) -> Comparison:
     data = split(opened.prepared, opened.truth)
     n, start = data.geometry.n_views, default_count(data.geometry, opened.grid.voxel_size)
     facts = {**opened.facts, "views used": str(n)}
-    methods, seconds = options.methods or names_compared(data.emission is not None), options.seconds
+    methods, seconds = options.methods or names_compared(data.prepared.emission is not None), options.seconds
     trials = (
-        plan(methods, n, start, options.depth) if seconds is None else plan_in_equal_time(methods, n, start, seconds)
+        quick_first(plan(methods, n, start, options.depth), expected_seconds(data.geometry, MachineSpeed()))
+        if seconds is None
+        else plan_in_equal_time(methods, n, start, seconds)
     )
     return data, trials, _table(options, facts, opened.prepared.length_unit, opened.light)
 
@@ -140,9 +145,7 @@ def split(prepared: PreparedProjections, truth: F32 | None) -> TrialData:
     """
     if truth is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
-    others = 0 if prepared.held_out is None else prepared.held_out[1].n_views
-    rays = prepared.rays_there(others)
-    return TrialData(prepared.projections.data, prepared.geometry, prepared.held_out, truth, rays, prepared.emission)
+    return TrialData(prepared, truth)
 
 
 def _in_time(options: TradeoffOptions, volumes: int, warn: Warn) -> Comparison:
@@ -156,9 +159,11 @@ def _in_time(options: TradeoffOptions, volumes: int, warn: Warn) -> Comparison:
     except ValueError as error:
         raise ConfigError(f"--time {volumes}: {error}. Nothing was written.") from error
     with scan.source.open() as source:
-        used, unseen = held.projections.view_ids, held.held_out_ids
-        seconds = times_of(source, used if unseen is None else np.concatenate((used, unseen)), warn)
-    data = replace(split(held, None), of_view=seconds - seconds.min())
+        unseen = held.projections.view_ids[:0] if held.held_out_ids is None else held.held_out_ids
+        seconds = times_of(source, np.concatenate((held.projections.view_ids, unseen)), warn)
+    begun = seconds - seconds.min()
+    n_used = held.geometry.n_views
+    data = TrialData(replace(held, times=begun[:n_used]), None, begun[n_used:])
     n, start = data.geometry.n_views, default_count(data.geometry, opened.grid.voxel_size)
     trials = plan_in_time(options.methods or _WITH_JOINT, n, start, volumes)
     facts = {**opened.facts, "views used": f"{n}, over {np.ptp(seconds):.4g} s"}
@@ -175,19 +180,17 @@ def _of_energies(options: TradeoffOptions, scans: EnergyScans, warn: Warn) -> Co
         raise ConfigError(f"--states: {error} of {scans.spectra.path}. Nothing was written.") from error
     prepared = prepare_energies(scans, scan.selection, warn)
     views = views_of(prepared)
-    energies, held_out = len(views.cross_sections), views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2
-    used, unseen = np.flatnonzero(~held_out), np.flatnonzero(held_out)
-    order, geometry = np.concatenate((used, unseen)), views.geometry.select(used)
-    data = TrialData(
-        views.projections[used], geometry, (views.projections[unseen], views.geometry.select(unseen)), None,
-        None if views.weight is None else views.weight[order],
-        of_view=views.energy[order].astype(np.float64), sections=views.cross_sections,
-    )  # fmt: skip
-    grid = Grid.matching(geometry)
+    weighted = replace(prepared.projections, weights=views.weight)  # also of the views held out
+    prepared = replace(prepared, projections=weighted, shares=None)
+    energies = len(views.cross_sections)
+    unseen = np.flatnonzero(views.parted(_HELD_OUT_ONE_IN) == _HELD_OUT_ONE_IN // 2)
+    data = TrialData(with_views_held_out(prepared, unseen), None, views.energy[unseen].astype(np.float64))
+    geometry = data.geometry
+    grid, used = Grid.matching(geometry), geometry.n_views
     start = default_count(geometry, grid.voxel_size)
-    trials = plan_of_energies(options.methods or _WITH_JOINT, used.size, start, energies, names, states)
+    trials = plan_of_energies(options.methods or _WITH_JOINT, used, start, energies, names, states)
     with scan.source.open() as source:
         facts = dict(facts_of(source).table)
-    facts |= {"energies": str(energies), "materials": ", ".join(names), "views used": str(used.size)}
+    facts |= {"energies": str(energies), "materials": ", ".join(names), "views used": str(used)}
     facts["volume"] = " × ".join(map(str, grid.shape))
     return data, trials, _table(options, facts, prepared.length_unit, None)

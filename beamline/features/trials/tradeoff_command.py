@@ -15,6 +15,7 @@ from beamline.cli.method_options import equal_time
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import (
     POSITIVE,
+    WholeRange,
     dry_option,
     json_option,
     names_in,
@@ -69,7 +70,7 @@ class TradeoffRequest:
         heading(METHOD),
         "--time",
         excludes={"spectra": "one is of one scan, the other of scans at several energies: give one of them"},
-        type=click.IntRange(min=2),
+        type=WholeRange(min=2),
         metavar="N",
         help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
     )

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Self
-
-import numpy as np
+from typing import Any, Literal
 
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
@@ -113,18 +111,6 @@ class Trial:
         """Plain values for a table, JSON or an event."""
         record = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "choice"}
         return {**record, **record.pop("settings"), "label": self.label}
-
-    def as_job(self) -> dict[str, Any]:
-        """Plain values that `of_job` takes."""
-        record = {f.name: getattr(self, f.name) for f in fields(self)}
-        groups = None if self.choice is None or self.choice.groups is None else self.choice.groups.tolist()
-        return {**record, "choice": self.choice and {"label": self.choice.label, "groups": groups}}
-
-    @classmethod
-    def of_job(cls, job: Mapping[str, Any]) -> Self:
-        """The trial that `as_job` wrote."""
-        choice = job["choice"] and ViewChoice(job["choice"]["label"], np.array(job["choice"]["groups"], np.int64))
-        return cls(**{**job, "choice": choice})
 
 
 def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:

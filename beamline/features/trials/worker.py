@@ -1,6 +1,6 @@
 """One trial in a process of its own, so that its peak memory is its own.
 
-`python -m beamline.features.trials.worker JOB.json` reads the job and its arrays, and says progress and the result as
+`python -m beamline.features.trials.worker JOB` reads the job and its arrays, and says progress and the result as
 lines of JSON on stdout. A job may also be to compile what trials will need, once for all of them: compiling takes
 memory that would otherwise count as the first trial's. Its stdin is a pipe that nothing is written to: when it ends,
 the parent process has ended, and this one ends, too.
@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import sys
 import time
 import warnings
@@ -22,29 +23,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 import recon
 from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
-from beamline.features.trials.data import TrialData, VolumeAt, by_parts, geometry_in, write_array
+from beamline.features.trials.data import TrialData, VolumeAt, averaged, by_parts, write_array
 from beamline.features.trials.trial import Trial
-from beamline.projections.held_out import with_held_out
+from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.measure import squares_left
+from beamline.reconstruct.run import binned, run_on
 from beamline.report.record import history_arrays, residual_curve
 from recon.assess import metrics
 from recon.assess.time_model import record
-from recon.base.arrays import F32, F64, I64
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
-from recon.base.method import DataUse, RunControl
+from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
+from recon.voxels.resolution import Resolution
 from recon.warm_up import warm_up
 
 Say = Callable[[Mapping[str, Any]], None]
@@ -71,32 +72,28 @@ def run(
         DataError: the disk did not take the volume.
     """
     if trial.choice is not None:
-        projections, geometry, use = data.chosen(trial.choice)
+        prepared = averaged(data.prepared, trial.choice)
     else:
-        views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
-        projections, geometry = data.projections[views], data.geometry.select(views)
-        use = _of_views(data.use, views, geometry)
-    seen, unseen_rays = use, data.rays_held_out
-    if use.weights is not None and unseen_rays is not None:
-        seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
+        angles, period = data.geometry.angles, data.geometry.period
+        prepared = data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
     grid, result, judged, warned = Grid.matching(data.geometry), None, None, list[warnings.WarningMessage]()
     ready(trial, data.geometry)
     reset_peak_memory()
     before, began = cpu(), now()
     if trial.parts > 1:
-        volume_at = _of_parts(trial, data, grid, seed)
+        volume_at = by_parts(trial.parts, data, lambda part: _alone(trial, part, grid, seed))
     else:
         control = ended_in_time(trial, now, _progress(say, now))
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
-            result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, control, seen)
+            result = reconstruct(trial, prepared, grid, seed, control)
         volume_at = result.at or partial(_always, on_grid(result.volume, grid).data)
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
     figures, squared = measured(volume_at, data, grid, keep)
     if trial.halves and trial.views >= 4:
-        figures["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
+        figures["resolution"] = half_set_resolution(trial, prepared, grid, seed)
     return {
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
@@ -116,26 +113,32 @@ def measured(
 ) -> tuple[dict[str, float], list[float]]:
     """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
     n, figures, squared = data.geometry.n_views, dict[str, float](), list[float]()
-    middle = volume_at(float(np.sort(data.shown[:n])[n // 2]))
+    middle = volume_at(float(np.sort(data.shown)[n // 2]))
     if keep is not None:
         write_array(keep, middle)
     if data.truth is not None:
         figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
-        if data.emission is not None:
+        if data.prepared.emission is not None:
             figures |= metrics.contrast(data.truth, middle)
     if data.reference is not None:
         figures["psnr_fbp"] = metrics.psnr(data.reference, middle)
         figures["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
     if data.regions is not None:
         figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
-    if data.held_out is not None:
-        unseen, geometry = data.held_out
-        root = np.float32(1) if data.rays_held_out is None else np.sqrt(data.rays_held_out)
-        off = root * (shown(volume_at, data.shown[n:], geometry, grid) - unseen)
-        if (scale := float(np.linalg.norm(root * unseen))) == 0:
+    if data.prepared.held_out is not None:
+        unseen, geometry = data.prepared.held_out
+        rays = data.rays_held_out
+        of_view = np.zeros(geometry.n_views) if data.shown_held_out is None else data.shown_held_out
+        left, own = squares_left(
+            shown(volume_at, of_view, geometry, grid),
+            unseen,
+            Resolution.of(geometry, grid),
+            None if rays is None else np.asarray(rays > 0),
+        )
+        if not own.any():
             raise ValueError("the views held out are all zero, so there is nothing to explain")
-        figures["residual_held_out"] = float(np.linalg.norm(off)) / scale
-        squared = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
+        figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
+        squared = left.tolist()
     return figures, squared
 
 
@@ -153,13 +156,10 @@ def ready(trial: Trial, geometry: Geometry) -> None:
     warm_up(trial.build(), geometry)
 
 
-def _of_parts(trial: Trial, data: TrialData, grid: Grid, seed: int) -> VolumeAt:
-    def fit(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
-        use = DataUse(weights)
-        control = ended_in_time(trial)
-        return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, control, use).volume, grid).data
-
-    return by_parts(trial.parts, data, fit)
+def _alone(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> F32:
+    """The volume [z, y, x] of these views alone, with no view held out."""
+    result = reconstruct(trial, replace(prepared, held_out=None), grid, seed, ended_in_time(trial))
+    return on_grid(result.volume, grid).data
 
 
 def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
@@ -171,66 +171,24 @@ def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> 
     return lines
 
 
-def half_set_resolution(
-    trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int, use: DataUse
-) -> float:
+def half_set_resolution(trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int) -> float:
     """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
+    geometry = prepared.geometry
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-
-    def half(views: NDArray[np.int64]) -> F32:
-        some, control = geometry.select(views), ended_in_time(trial)
-        result = reconstruct(trial, projections[views], some, grid, None, seed, control, _of_views(use, views, some))
-        return on_grid(result.volume, grid).data
-
-    even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
+    even, odd = (_alone(trial, prepared.of_views(np.sort(order[n::2])), grid, seed) for n in (0, 1))
     return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
 
 
-def _of_views(use: DataUse, views: I64, geometry: Geometry) -> DataUse:
-    """What is known of these views, which `geometry` is of."""
-    emission = None if use.emission is None else use.emission.summed(views[:, None], geometry)
-    times, energies = use.times, use.energies
-    return DataUse(
-        None if use.weights is None else use.weights[views],
-        (),
-        emission,
-        None if times is None else times[views],
-        None if energies is None else replace(energies, of_view=energies.of_view[views]),
-    )
-
-
 def reconstruct(
-    trial: Trial,
-    projections: F32,
-    geometry: Geometry,
-    grid: Grid,
-    held_out: tuple[F32, Geometry] | None,
-    seed: int,
-    control: RunControl,
-    use: DataUse,
+    trial: Trial, prepared: PreparedProjections, grid: Grid, seed: int, control: RunControl
 ) -> Reconstruction:
-    """The one place that turns a trial into a call of recon.reconstruct.
+    """The volume of a trial, as every command makes one.
 
-    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel. Weights
-    of `use` are of the views, and of those held out after them; it names no views held out.
+    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel.
     """
-    method, unseen, weights = trial.build(), list[int](), use.weights
-    if method.traits.held_out:
-        projections, geometry, unseen = with_held_out(projections, geometry, held_out)
-    if weights is not None:
-        weights = weights[: len(projections)]
-        if trial.binning > 1:
-            projections, weights = masked(projections, weights)[0], bin_views(weights, trial.binning)
-    use = DataUse(
-        weights,
-        unseen,
-        use.emission if trial.binning == 1 and not unseen else None,
-        use.times if method.traits.in_time else None,
-        use.energies if method.traits.by_energy else None,
-    )
-    binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
-    target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
-    return recon.reconstruct(binned, coarse, method, grid=target, seed=seed, use=use, control=control)
+    method, views = trial.build(), binned(prepared, trial.binning)
+    target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(views.geometry)
+    return run_on(method, views, target, seed, control)
 
 
 def ended_in_time(
@@ -290,27 +248,20 @@ def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], 
 
 
 def main(job: Path) -> int:
-    """Run the job in the file `job`.
-
-    That is {"data": folder, "trial": {...}, "seed": n, "keep": .npy or null}, or
-    {"data": folder, "compile": [{...}, ...]}.
-    """
+    """Run the `TrialJob` in the file `job`."""
 
     def say(line: Mapping[str, Any]) -> None:
         print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
 
-    request = json.loads(job.read_text(encoding="utf-8"))
-    if "compile" in request:
-        geometry = geometry_in(Path(request["data"]))
-        for trial in request["compile"]:
-            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                ready(Trial.of_job(trial), geometry)
-        return 0
-    trial = Trial.of_job(request["trial"])
-    keep = request.get("keep")
+    work = pickle.loads(job.read_bytes())  # noqa: S301 - written by the process that started this one
     try:
-        data = TrialData.load(Path(request["data"]))
-        result = run(trial, data, int(request["seed"]), say, keep=None if keep is None else Path(keep))
+        data = TrialData.load(work.data)
+        for trial in work.compiled:
+            with suppress(ValueError):  # a method that does not take these views: its own trial will say so
+                ready(trial, data.geometry)
+        if work.trial is None:
+            return 0
+        result = run(work.trial, data, work.seed, say, keep=work.keep)
     except ValueError as error:
         say({"event": "failed", "message": str(error)})
         return 1

@@ -12,7 +12,7 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.projections.corrections.counts import CountModel
-from beamline.projections.protocols import ScanPart, ViewFilter
+from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
 from beamline.projections.selection import cone_of
 from beamline.projections.step import StepDone, StepMemory, option
 from drivers.base.frame import FrameKind
@@ -236,7 +236,7 @@ def _refined(
 
 def _without_blur(selection: Selection) -> Selection:
     """The selection without the corrections that blur the views."""
-    sharp = tuple(step for step in selection.steps if not getattr(step, "blurs", False))
+    sharp = tuple(step for step in selection.steps if not isinstance(step, BlurringStep))
     return replace(selection, steps=sharp).with_steps(CountModel("log"))
 
 

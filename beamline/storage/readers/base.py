@@ -18,6 +18,7 @@ from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.writers.ending import ScanEnding
 from drivers.base.frame import Frame, FrameKind
+from recon.base.arrays import Mask
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
 Stated = Quantity | Literal["transmission"]
@@ -34,6 +35,14 @@ class NotUsed(NamedTuple):
     value: str
     why: str
     doubt: bool
+
+
+class Used(NamedTuple):
+    """A field that a file states and that is used: where it is, its value, what for."""
+
+    where: str
+    value: str
+    use: str
 
 
 class EmissionCounts(NamedTuple):
@@ -73,6 +82,7 @@ class ScanSource(ABC):
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
             they were taken.
         numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
+        pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
     """
 
@@ -94,6 +104,7 @@ class ScanSource(ABC):
     row_pitch_mm: float | None = None
     in_order: bool = True
     numbers: NDArray[np.int64] | None = None
+    pixel_mask: Mask | None = None
     frames_per_view: int = 1
 
     @property
@@ -132,6 +143,11 @@ class ScanSource(ABC):
         return ()
 
     @property
+    def used(self) -> tuple[Used, ...]:
+        """What the file states of each frame, and of exposure, current, energy and geometry, and what is used."""
+        return ()
+
+    @property
     def flags(self) -> FrameFlags | None:
         """Of the monitor, by frame; None where no monitor looked at the frames."""
         return None
@@ -142,6 +158,11 @@ class ScanSource(ABC):
 
         NaN where unknown; None where there is no monitor.
         """
+        return None
+
+    @property
+    def energies(self) -> NDArray[np.float64] | None:
+        """float64 [frame] keV, NaN where unknown; None where the file states none of each frame."""
         return None
 
     @property
@@ -321,10 +342,12 @@ class Opening:
     Attributes:
         follow: the file may still be growing.
         own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
+        one_series: the caller says the kind of each frame; names of files say none.
     """
 
     follow: bool = False
     own_angles: bool = True
+    one_series: bool = False
 
 
 @dataclass(frozen=True)

@@ -28,16 +28,27 @@ from beamline.storage.readers.base import (
     Quantity,
     ScanFormat,
     ScanSource,
+    Used,
     count_in_blocks,
     frame_indices,
     read_known,
 )
-from beamline.storage.readers.nexus import choose, differing, find, read_energy, read_geometry, require_order
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_copied, not_used
+from beamline.storage.readers.nexus import (
+    Places,
+    choose,
+    differing,
+    find,
+    read_energies,
+    read_energy,
+    read_geometry,
+    require_order,
+)
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, not_used, unknown_fields
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
+from recon.base.arrays import Mask
 
 
 class NXtomoSource(ScanSource):
@@ -51,7 +62,8 @@ class NXtomoSource(ScanSource):
         self.path = path
         self._file = hdf5.open_hdf5(path, follow)
         try:
-            self._places = places = choose(self._file, find(self._file), data)
+            found = find(self._file)
+            self._places = places = choose(self._file, found, data)
             self._ours = layout.COMMITTED in self._file
             self._check()
             shape = places.data.shape
@@ -69,6 +81,7 @@ class NXtomoSource(ScanSource):
                 self.pixel_size_mm, height = self._geometry.pixel_mm
                 self.row_pitch_mm = differing(height, self.pixel_size_mm)
                 self.cone = self._geometry.cone
+                self.pixel_mask = self._mask(self._geometry.mirrored)
             self.energy_kev = read_energy(places.entry)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
             self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
@@ -77,7 +90,9 @@ class NXtomoSource(ScanSource):
             self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
-            self._not_used = self._find_not_used()
+            self._not_used = self._find_not_used(found if data is None else [])
+            self._used = self._find_used()
+            self._energies = None if self._ours else read_energies(places.entry, self.n)
         except BaseException:
             self._file.close()
             raise
@@ -93,6 +108,16 @@ class NXtomoSource(ScanSource):
                 "expected a positive distance of the source. Correct it in a copy of the file."
             )
         return sod, sod + beyond
+
+    def _mask(self, mirrored: tuple[bool, bool]) -> Mask | None:
+        """Pixels that NXdetector's mask names, for any of its reasons; None without a mask of the frames' shape."""
+        item = hdf5.dataset(self._places.detector, "pixel_mask")
+        if item is None or item.shape[-2:] != self.shape or item.dtype.kind not in "uib":
+            return None
+        if item.size != self.shape[0] * self.shape[1]:
+            return None
+        mask = np.asarray(hdf5.values_of(item)).reshape(self.shape) != 0
+        return mask[:: -1 if mirrored[0] else 1, :: -1 if mirrored[1] else 1]
 
     def _check(self) -> None:
         finer = hdf5.dataset(self._places.detector, "image_key_control")
@@ -204,17 +229,37 @@ class NXtomoSource(ScanSource):
             ending = ending_in(self._file)
             return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
-    def _find_not_used(self) -> tuple[NotUsed, ...]:
+    def _find_not_used(self, found: list[Places]) -> tuple[NotUsed, ...]:
         outside = not_copied(self._places.entry, TEXTS.values())
         if self._geometry is None:
             return outside
-        fields = outside + not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        detector = str(self._places.detector.name)
+        fields = outside + not_used(NXTOMO, self._places.entry, self, detector)
+        fields += unknown_fields(NXTOMO, self._places.entry, self, detector)
+        for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
+            shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
+            fields += (
+                NotUsed(where, f"{shape} frames", f"it is another scan of this file: --data-path {where}", True),
+            )
         turned = self._geometry.turned
         return (*fields, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else fields
+
+    def _find_used(self) -> tuple[Used, ...]:
+        if self._geometry is None:
+            return ()
+        return in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
 
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
         return self._not_used
+
+    @property
+    def used(self) -> tuple[Used, ...]:
+        return self._used
+
+    @property
+    def energies(self) -> NDArray[np.float64] | None:
+        return self._energies
 
     @property
     def flags(self) -> FrameFlags | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
@@ -19,18 +19,22 @@ from beamline.storage.readers.angle_table import Angles, load_angles, parse_angl
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.nexus import find
+from beamline.storage.readers.no_data import MarkedSource, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
+from beamline.storage.readers.side_files import SidedSource, SideFile, read_side_file, side_of
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.wrapped import (
     UNPACKED,
     CroppedSource,
+    KeyedSource,
     PartsSource,
     TurnedSource,
     UnsignedSource,
     type_wrapped,
 )
+from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.registry import Registry, in_folders
 
@@ -82,6 +86,10 @@ class SourceOptions:
         angles_unit: "deg" or "rad", of these, instead of what the file says.
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
+        frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
+            files in a folder then say no kinds.
+        then: further files of the same scan, whose frames follow.
+        side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
         frames_per_view: consecutive projections that are averaged to one; None: as many as the plan in the file says.
     """
@@ -99,6 +107,9 @@ class SourceOptions:
     angles_unit: str | None = None
     horizontal_axis: bool = False
     earlier: tuple[Path, ...] = ()
+    frames: str | None = None
+    then: tuple[Path, ...] = ()
+    side_file: Path | None = None
     cols: tuple[int, int] | None = None
     frames_per_view: int | None = 1
 
@@ -120,51 +131,91 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
-    base: ScanSource
-    path, angles, darks, flats = Path(options.path), options.angles, options.darks, options.flats
+    path = Path(options.path)
     _refuse(options, follow)
-    if options.data_path is not None:
-        with hdf5.readable(path):
-            base = _at_data_path(path, options.data_path, options)
-    else:
-        base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
+    base = _base(path, options, follow)
     try:
-        if options.earlier:
-            base = _of_parts(options.earlier, base)
-        angle_table, angles_from = _angle_table(options, base)
-        if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
-            base = UnsignedSource(base, dtype)
-        if options.quantity == "transmission":
-            darks, flats = _beam_of_one(base, options)
-        n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
-        angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
-        if any(given is not None for given in (angles_of_all, darks, flats, options.quantity)):
-            base = OverlaidSource(
-                base,
-                angles=angles_of_all,
-                angles_from=angles_from,
-                of_views=options.angle_rows is not None,
-                darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
-                flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
-                quantity="counts" if options.quantity == "transmission" else options.quantity,
-            )
-        if n > 1:
-            base = AveragedSource(base, n)
-        if options.horizontal_axis:
-            base = TurnedSource(base)
-        return base if options.cols is None else CroppedSource(base, options.cols)
+        return _with_replacements(base, options)
+    except DataError as error:
+        base.close()
+        side = side_of(base) if options.side_file is None else None
+        if side is None:
+            raise
+        raise DataError(f"{error} Beside it lies {side.path.name}: --from {side.path} takes it ({side}).") from error
     except BaseException:
         base.close()
         raise
 
 
-def _angle_table(options: SourceOptions, base: ScanSource) -> tuple[NDArray[np.float64] | None, str]:
+def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
+    """The frames of all files, of the kinds that the caller says."""
+    opening = Opening(follow, options.angles is None and options.angles_path is None, options.frames is not None)
+    with ExitStack() as opened:
+
+        def file(path: Path) -> ScanSource:
+            if options.data_path is None:
+                return opened.enter_context(_open(path, opening))
+            with hdf5.readable(path):
+                return opened.enter_context(_at_data_path(path, options.data_path, options))
+
+        base = file(path)
+        if options.then:
+            base = PartsSource([base, *map(file, options.then[:-1])], file(options.then[-1]), path)
+        if options.earlier:
+            base = PartsSource([opened.enter_context(_open(each, Opening())) for each in options.earlier], base)
+        if options.frames is not None:
+            base = KeyedSource(base, options.frames)
+        opened.pop_all()
+    return base
+
+
+def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
+    """The scan with what the caller says instead of its files."""
+    darks, flats, quantity = options.darks, options.flats, options.quantity
+    side = None if options.side_file is None else read_side_file(options.side_file)
+    if side is not None:
+        base = SidedSource(base, side)
+    angle_table, angles_from = _angle_table(options, base, side)
+    if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
+        base = UnsignedSource(base, dtype)
+    if quantity == "transmission":
+        darks, flats = _beam_of_one(base, options)
+    elif side is not None and side.white is not None and base.dtype.kind in "ui":
+        flats = np.full((1, *base.shape), side.white, base.dtype) if flats is None else flats
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None else darks
+    if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
+        base = marked = MarkedSource(base, no_data)
+        darks = np.zeros((1, *base.shape), base.dtype) if darks is None and marked.counter else darks
+    n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
+    angles_of_all = None if angle_table is None else angles_of_frames(angle_table, base, n)
+    if any(given is not None for given in (angles_of_all, darks, flats, quantity)):
+        base = OverlaidSource(
+            base,
+            angles=angles_of_all,
+            angles_from=angles_from,
+            of_views=options.angle_rows is not None,
+            darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
+            flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
+            quantity="counts" if quantity == "transmission" else quantity,
+        )
+    if n > 1:
+        base = AveragedSource(base, n)
+    if options.horizontal_axis:
+        base = TurnedSource(base)
+    return base if options.cols is None else CroppedSource(base, options.cols)
+
+
+def _angle_table(
+    options: SourceOptions, base: ScanSource, side: SideFile | None
+) -> tuple[NDArray[np.float64] | None, str]:
     """The angles that are given or stand beside a TIFF series, and where they come from; None: the scan's own."""
     table = None if options.angles is None else load_angles(options.angles)
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
         origin = f"{options.angles_path} in {options.path}"
         table = angles_at(Path(options.path), options.angles_path, options.angles_unit)
+    if table is None and side is not None and side.angles is not None:
+        table, origin = side.angles, str(side.path)
     if table is None and base.angle_text is not None:
         origin = f"{base.angle_text[0]} in {options.path}"
         table = parse_angles(base.angle_text[1], origin)
@@ -215,37 +266,45 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
             yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 
 
-def _of_parts(earlier: Sequence[Path], last: ScanSource) -> ScanSource:
-    with ExitStack() as opened:
-        sources = [opened.enter_context(_open(path, Opening())) for path in earlier]
-        parts = PartsSource(sources, last)
-        opened.pop_all()
-    return parts
-
-
 def _open(path: Path, opening: Opening) -> ScanSource:
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
     if not hdf5.is_hdf5(path):
+        saved = path.suffix == ".npz" and ", but arrays saved by Python: `beamline view` shows a volume of these"
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm; a scan is one of these, or a folder or .zip of TIFFs."
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm{saved or ''}; a scan is one of these, or a folder or .zip "
+            "of TIFFs."
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        held = datasets_text(file)
+        held, is_volume = datasets_text(file), hdf5.text_at(file, "entry/definition") == "NXtomoproc"
+    if is_volume:
+        with opened_reconstruction(path) as record:
+            made_by = record.method or "another program"
+        raise DataError(
+            f"{path} is a volume, made by {made_by}, not a scan: `beamline view {path}` shows it, and `beamline "
+            "export` writes it in another format."
+        )
     raise DataError(
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
     )
 
 
+def scan_format(path: Path) -> str | None:
+    """The name of the format of a scan that an HDF5 file holds; None: of none."""
+    with hdf5.readable(path):
+        return next((kind.name for kind in FORMATS if kind.recognises(path, Opening())), None)
+
+
 def _refuse(options: SourceOptions, follow: bool) -> None:
     """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
-    replaced += ["--horizontal-axis"] if options.horizontal_axis else []
+    own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "then": options.then}
+    replaced += [f"--{name}" for name, given in (own_kinds | {"from": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import lzma
 import math
 import re
 import zipfile
-import zlib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,20 +16,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.hdf5 import ALTERED
 from beamline.storage.header import PACKED
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-UNREADABLE = (
-    tifffile.TiffFileError,
-    OSError,
-    ValueError,
-    LookupError,
-    EOFError,
-    zipfile.BadZipFile,
-    zlib.error,
-    MemoryError,
-)
+UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile)
+"""What tifffile, zipfile and their decoders raise for a file that they cannot read; none of ours is among them."""
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
 
@@ -58,6 +52,7 @@ def is_hidden(name: str) -> bool:
 def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
     """All pages of a TIFF; [row, col] for one page. ValueError where it claims more bytes, or more than it can hold."""
     with tifffile.TiffFile(file) as tif:
+        refuse_packed(tif)
         claimed, stored = sum(page.nbytes for page in tif.pages), tif.filehandle.size
         if claimed > min(most, PACKED * stored):
             raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
@@ -66,10 +61,21 @@ def read_image(file: Path | BinaryIO, most: float = math.inf) -> NDArray[Any]:
 
 def image_of(tif: tifffile.TiffFile) -> tuple[tuple[int, ...], np.dtype[Any]]:
     """Shape and type of what `read_image` gives, by the heads of its pages. ValueError where they tell no type."""
+    refuse_packed(tif)
     first = tif.series[0]
     if first.dtype is None:
         raise ValueError("its pixels are of an unknown type")
     return ((len(tif.pages), *first.shape) if pages_one_by_one(tif) else first.shape), first.dtype
+
+
+def refuse_packed(tif: tifffile.TiffFile) -> None:
+    """ValueError for pixels of 10, 12 or 14 bits without a gap, where nothing unpacks them."""
+    bits = tif.pages.first.bitspersample
+    if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
+        raise ValueError(
+            f"its pixels are packed, {bits} bits each: pip install imagecodecs, which unpacks them, or write the "
+            "images with 16 bits a pixel"
+        )
 
 
 def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:

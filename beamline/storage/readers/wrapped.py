@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
-from drivers.base.frame import Frame
+from drivers.base.frame import Frame, FrameKind
 
 UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
@@ -27,6 +29,7 @@ class WrappedSource(ScanSource):
         self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
         self.cone, self.axis_col, self.row_pitch_mm = base.cone, base.axis_col, base.row_pitch_mm
         self.in_order, self.numbers, self.frames_per_view = base.in_order, base.numbers, base.frames_per_view
+        self.pixel_mask = base.pixel_mask
 
     def _update(self) -> None:
         """Take over the present frames of `base`."""
@@ -141,6 +144,102 @@ class TurnedSource(WrappedSource):
         )
 
 
+class KeyedSource(WrappedSource):
+    """A ScanSource whose frames are of the kinds that a caller says, or those of one energy."""
+
+    def __init__(self, base: ScanSource, kinds: str) -> None:
+        """Take `kinds` such as "darks=0:5,flats=5:10+95:100,views=10:95": rows of the scan, ends not included.
+
+        Without views all other frames are projections, else invalid. "energy=20" makes frames of other energies
+        invalid, by the file.
+
+        Raises:
+            DataError: they are no such text, lie outside the scan, or the file states no such energy.
+        """
+        super().__init__(base)
+        words = [word.strip() for word in kinds.split(",")]
+        named = [word for word in words if not word.startswith(_ENERGY)]
+        self._keys = _stated_keys(",".join(named), int(base.image_key.size)) if named else base.image_key.copy()
+        for word in words:
+            if word.startswith(_ENERGY):
+                self.energy_kev, others = _of_one_energy(base, word)
+                self._keys[others] = FrameKind.INVALID
+        if base.quantity == "unknown" and base.dtype.kind in "ui" and {*self._keys.tolist()} >= {1, 2}:
+            self.quantity = "counts"
+        self._update()
+
+    def _update(self) -> None:
+        super()._update()
+        self.image_key = self._keys
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return self._base.read(frames, rows)
+
+
+def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
+    """The kind of each of n frames by what the caller says."""
+    stated, named = np.full(n, -1), _ranges(kinds, n)
+    for kind, first, end in named:
+        if (stated[first:end] >= 0).any():
+            raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
+        stated[first:end] = kind
+    others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
+    return np.where(stated < 0, others, stated).astype(np.int32)
+
+
+def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:
+    """keV of "energy=20", and the frames of other energies."""
+    try:
+        kev = float(word.removeprefix(_ENERGY))
+    except ValueError:
+        raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
+    known = source.energies
+    if known is None:
+        raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
+    others = np.abs(known - kev) > _SAME_ENERGY * kev
+    if not (np.isfinite(known) & ~others).any():
+        raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
+    return kev, others
+
+
+def in_words(energies: NDArray[np.float64]) -> str:
+    """How many frames have which energy, such as "45 at 20 keV and 45 at 30 keV"."""
+    parts = of_energies(energies)
+    listed = [f"{n} at {kev:.6g} keV" for kev, n in parts[:_LISTED]]
+    listed += [f"and more up to {parts[-1][0]:.6g} keV"] if len(parts) > _LISTED else []
+    return ", ".join(listed)
+
+
+def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
+    """(keV, number of frames) of each energy; what differs by a part in ten thousand is one."""
+    known = np.sort(energies[np.isfinite(energies)])
+    parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)
+    return [(float(np.median(part)), int(part.size)) for part in parts if part.size]
+
+
+_ENERGY = "energy="
+_SAME_ENERGY = 1e-4  # as a monochromator repeats one
+_LISTED = 6  # energies in a sentence
+_KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
+
+
+def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
+    """Kind and rows [first, end) of each range in `kinds`; DataError for what is none."""
+    ranges = []
+    for word in kinds.split(","):
+        name, _, places = word.strip().partition("=")
+        for place in places.split("+"):
+            match = re.fullmatch(r"\s*(\d{1,9})?:(\d{1,9})?\s*", place)
+            first, end = (int(match[1] or 0), int(match[2] or n)) if match else (0, 0)
+            if name not in _KINDS or not first < end <= n:
+                raise DataError(
+                    f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
+                    "such as darks=0:5,flats=5:10+95:100. Frames are counted from 0 in the order of the scan."
+                )
+            ranges.append((_KINDS[name], first, end))
+    return ranges
+
+
 class UnsignedSource(WrappedSource):
     """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
 
@@ -192,9 +291,14 @@ class PartsSource(WrappedSource):
     Row numbers, such as the row that a frame replaces, count from the first frame of all files.
     """
 
-    def __init__(self, earlier: Sequence[ScanSource], last: ScanSource) -> None:
-        """Put them together; DataError where frames are of another shape or type. It closes all of them."""
-        self._sources = (*earlier, last)
+    def __init__(self, earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> None:
+        """Put them together; DataError where frames are of another shape or type. It closes all of them.
+
+        Args:
+            path: of the scan, where somebody said that the files are one, taken without a pause; None: they are parts,
+                between which beam and camera may have changed.
+        """
+        self._sources, self._one = (*earlier, last), path is not None
         for source in earlier:
             if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
                 raise DataError(
@@ -202,6 +306,8 @@ class PartsSource(WrappedSource):
                     f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
                 )
         super().__init__(last)
+        self.path, self.in_order = path or last.path, all(source.in_order for source in self._sources)
+        self.numbers = None
         self._earlier_flags = [_as_of_today(source) for source in earlier]
         self._update()
 
@@ -233,6 +339,8 @@ class PartsSource(WrappedSource):
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
+        if self._one:
+            return np.zeros(1, np.int64)
         return np.concatenate(
             [s.part_starts + first for s, first in zip(self._sources, self._firsts[:-1], strict=True)]
         )
@@ -251,7 +359,7 @@ class PartsSource(WrappedSource):
         pairs = zip(self._sources, self._firsts[:-1], strict=True)
         return frozenset(int(row + first) for source, first in pairs for row in source.damaged)
 
-    currents, shifts = ScanSource.currents, ScanSource.shifts  # not told of parts
+    currents, energies, shifts = ScanSource.currents, ScanSource.energies, ScanSource.shifts  # not told of parts
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

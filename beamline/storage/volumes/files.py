@@ -46,6 +46,10 @@ def format_of(path: Path) -> VolumeFormat:
     kind_of_file = next((kind for kind in formats() if suffix in kind.suffixes), None)
     if kind_of_file is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
+        if path.name.lower().endswith((".nii", ".nii.gz")):
+            raise ValueError(
+                f"{str(path)!r}: NIfTI is read, not written; .nrrd holds the same, and programs that read NIfTI read it"
+            )
         raise ValueError(
             f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}"
             f"{did_you_mean(suffix, [each for kind in formats() for each in kind.suffixes])}."

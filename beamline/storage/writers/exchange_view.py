@@ -6,16 +6,12 @@ data", J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.journal import FileChange, FileChanges
 from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
@@ -28,7 +24,10 @@ def add_exchange_view(file: h5py.File) -> None:
     """Fill /exchange with the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
     source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
     units = file["/entry/record/quantity"].asstr()[()]
+    there = {*group}  # of a recovery that was stopped
     for name, rows in _rows(file).items():
+        if {name, THETA[name]} <= there:
+            continue
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)
         filled = 0
         for first, last in hdf5.runs(rows):
@@ -46,21 +45,21 @@ def has_exchange_view(file: h5py.File) -> bool:
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 
-def with_exchange_view(path: Path, changes: Sequence[FileChange] = ()) -> FileChanges:
-    """What has to change in a closed file of a scan, beside other changes, for its /exchange view.
+def with_exchange_view(overlay: Overlay) -> Overlay:
+    """A closed file of a scan with the view, to be carried out.
 
-    That is the group, which frames do not hang on, and the head; all else is added at the end.
+    What changes are the group, which frames do not hang on, and the head; all else is added at the end.
 
     Raises:
-        DataError: it cannot be read.
+        DataError: the file cannot be read.
     """
+    made = overlay.copy()
     try:
-        overlay = Overlay(path, changes)
-        with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
+        with h5py.File(made, "r+", libver=layout.LIBVER) as file:
             add_exchange_view(file)
-        return overlay.changes()
     except hdf5.ALTERED as error:
-        raise DataError(f"{path} does not take the view ({hdf5.reason(error)}). Nothing was changed.") from error
+        raise DataError(f"{made.path} does not take the view ({hdf5.reason(error)}). Nothing was changed.") from error
+    return made
 
 
 def _rows(file: h5py.File) -> dict[str, NDArray[np.intp]]:

@@ -25,6 +25,7 @@ from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of, place_of
+from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
@@ -318,7 +319,7 @@ class NXtomoWriter:
             )
             return
         try:
-            with_exchange_view(self.path).carry_out()
+            with_exchange_view(Overlay(self.path)).carry_out()
         except DataError as error:
             self.remarks.append(
                 f"{self.path} has no /exchange view: {error} Its {self._committed} frames are safe in /entry; "

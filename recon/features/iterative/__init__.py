@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import MethodEntry
+from recon.base.method_entry import Lengths, MethodEntry
 
 METHODS = {
-    "sirt": MethodEntry("recon.features.iterative.sirt", "Sirt"),
-    "sart": MethodEntry("recon.features.iterative.sart", "Sart"),
-    "cgls": MethodEntry("recon.features.iterative.cgls", "Cgls"),
-    "asd-pocs": MethodEntry("recon.features.iterative.asd_pocs", "AsdPocs"),
+    "sirt": MethodEntry(
+        "recon.features.iterative.sirt", "Sirt", lengths=Lengths("iterations", (60, 20), (100, 10, 30, 300))
+    ),
+    "sart": MethodEntry("recon.features.iterative.sart", "Sart", lengths=Lengths("iterations", (6, 2), (10, 1, 3, 30))),
+    "cgls": MethodEntry(
+        "recon.features.iterative.cgls", "Cgls", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
+    ),
+    "asd-pocs": MethodEntry(
+        "recon.features.iterative.asd_pocs", "AsdPocs", lengths=Lengths("iterations", (10,), (20, 5, 50))
+    ),
 }

@@ -75,9 +75,11 @@ class TimeSeries:
         series = VolumeSeries(made.times - times.min(), np.stack([made.at(at) for at in made.times]), made.residual)
         settings: dict[str, Any] = {"volumes": self.volumes, "moves": made.motion is not None, "sweeps": self.sweeps}
         settings |= {"view_seconds": times - times.min()} | ({} if made.smooth is None else {"smooth": made.smooth})
-        if made.unseen_residuals is not None:
-            settings["chosen_because"] = _because(*made.unseen_residuals, moves=made.motion is not None)
-        return history.result(series, made.grid, settings, made.at)
+        if made.unseen_residuals is None:
+            return history.result(series, made.grid, settings, made.at)
+        because = _because(*made.unseen_residuals, moves=made.motion is not None)
+        settings["chosen_because"] = because
+        return replace(history.result(series, made.grid, settings, made.at), chosen=because)
 
     def toy(self) -> Self:
         return replace(self, volumes=2, moves=True if self.moves is None else self.moves, sweeps=1)

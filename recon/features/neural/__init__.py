@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import MethodEntry
+from recon.base.method_entry import Lengths, MethodEntry
 
+_LENGTHS = Lengths("steps", (300,), (1000, 3000))
 METHODS = {
-    "naf": MethodEntry("recon.features.neural.methods", "NAF", compared=False),
-    "intratomo": MethodEntry("recon.features.neural.methods", "IntraTomo", compared=False),
-    "sax-nerf": MethodEntry("recon.features.neural.methods", "SaxNerf", compared=False),
+    "naf": MethodEntry("recon.features.neural.methods", "NAF", compared=False, lengths=_LENGTHS),
+    "intratomo": MethodEntry("recon.features.neural.methods", "IntraTomo", compared=False, lengths=_LENGTHS),
+    "sax-nerf": MethodEntry("recon.features.neural.methods", "SaxNerf", compared=False, lengths=_LENGTHS),
 }
 
 OPERATIONS = {"field": "recon.features.neural.speed"}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from skimage.measure import regionprops_table
+from skimage.morphology import ball, local_maxima, reconstruction
+from skimage.segmentation import watershed
 
 from recon.base.arrays import F32, Mask
 from recon.base.choices import NECK as NECK
@@ -17,6 +19,8 @@ Labels = NDArray[np.int32]
 
 _MARGIN = 3  # voxels around a particle that are looked at for its boundary
 _TOGETHER, _PLACED = 1.2, 0.07  # voxels, see `volume_deviation`
+
+_FACES = ndimage.generate_binary_structure(3, 1)  # neighbours of a voxel, with itself
 
 _GRID = 0.5
 """Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
@@ -57,12 +61,6 @@ class Particles:
                 "d90": float(d90),
             }
         return statistics
-
-
-def ball(radius: int) -> Mask:
-    """A structuring element: voxels at most `radius` from the middle."""
-    squares = np.arange(-radius, radius + 1) ** 2
-    return squares[:, None, None] + squares[:, None] + squares <= radius**2
 
 
 def bodies_outside(mask: Mask, box: tuple[slice, slice, slice]) -> int:
@@ -112,11 +110,12 @@ def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
 def parted(mask: Mask, neck: float = NECK) -> Labels:
     """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, separated at narrow necks.
 
-    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two basins are joined again
-    if the distance on the neck between them is at least `neck` times the smaller maximum, widest necks first.
+    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two maxima are one particle if
+    the distance on the neck between them is at least `neck` times the smaller one: a maximum counts if its dynamics in
+    log(distance) are larger than -log(neck) (Grimaud 1992).
 
     Args:
-        neck: 0: connected parts as they are; above 1: every maximum is a particle.
+        neck: 0: connected parts as they are; 1 or more: every maximum is a particle.
     """
     connected, _ = ndimage.label(mask)
     if neck <= 0:
@@ -124,7 +123,13 @@ def parted(mask: Mask, neck: float = NECK) -> Labels:
     labels, last = np.zeros(mask.shape, np.int32), 0
     for number, box in enumerate(ndimage.find_objects(connected), 1):
         inside = np.pad(connected[box] == number, 1)
-        basins = _joined(*_basins(inside), neck)[1:-1, 1:-1, 1:-1]
+        distance = ndimage.distance_transform_edt(inside).astype(np.float32)
+        tops = distance
+        if neck < 1:  # with this offset, heights differ by log(neck) where distances are `neck` times, less _GRID
+            height = np.log(distance + np.float32(_GRID / (1 - neck)))
+            tops = reconstruction(height + np.float32(math.log(neck)), height, footprint=_FACES)
+        maxima, _ = ndimage.label(local_maxima(tops, connectivity=1) & inside)
+        basins = watershed(-ndimage.gaussian_filter(distance, 0.7), maxima, 3, mask=inside)[1:-1, 1:-1, 1:-1]
         labels[box] = np.where(basins > 0, basins + last, labels[box])
         last += int(basins.max())
     return labels
@@ -140,25 +145,11 @@ def measured(
         spacing: edges of a voxel (z, y, x).
         origin: centre of the first voxel (z, y, x).
     """
-    counts = np.bincount(labels.ravel())
-    labels_present = np.flatnonzero(counts[1:]) + 1
-    sums = np.zeros((counts.size, 3))
-    for axis in range(3):
-        # Per slice, so that no array of coordinates is as large as the volume.
-        for place, plane in enumerate(np.moveaxis(labels, axis, 0)):
-            here, n = np.unique(plane, return_counts=True)
-            sums[here, axis] += place * n
-    faces = [
-        labels[face] for axis in range(3) for face in ((slice(None),) * axis + (0,), (slice(None),) * axis + (-1,))
-    ]
-    touched = np.unique(np.concatenate([face.ravel() for face in faces]))
-    centroid = np.asarray(origin) + sums[labels_present] / counts[labels_present, None] * np.asarray(spacing)
-    return Particles(
-        labels_present.astype(np.int32),
-        counts[labels_present] * np.float64(np.prod(spacing)),
-        centroid,
-        np.isin(labels_present, touched),
-    )
+    found = regionprops_table(labels, properties=("label", "area", "centroid", "bbox"), spacing=spacing)
+    ends = np.array([[found[f"bbox-{axis}"], found[f"bbox-{axis + 3}"]] for axis in range(3)])
+    cut = (ends[:, 0] == 0) | (ends[:, 1] == np.array(labels.shape)[:, None])
+    centroid = np.stack([found[f"centroid-{axis}"] + origin[axis] for axis in range(3)], axis=1)
+    return Particles(found["label"].astype(np.int32), found["area"].astype(np.float64), centroid, cut.any(axis=0))
 
 
 def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float) -> NDArray[np.float64]:
@@ -192,54 +183,3 @@ def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float
             math.sqrt(noise + (_PLACED * 2 / 3 * faces) ** 2)
         )  # a ball has 3/2 faces per unit of its surface
     return np.array(deviations)
-
-
-def _basins(inside: Mask) -> tuple[Labels, F32]:
-    """The basin of each maximum of the distance to the outside, and that distance; False on all faces of `inside`.
-
-    Every voxel belongs to the maximum at the end of its steepest ascent. (`scipy.ndimage.watershed_ift` grows by the
-    differences of neighbours, not by their values, and does not find the necks of a smooth distance.)
-    """
-    distance = ndimage.distance_transform_edt(inside).astype(np.float32)
-    height = np.where(inside, ndimage.gaussian_filter(distance, 0.7), -1)
-    own = np.arange(height.size).reshape(height.shape)
-    best, up = height.copy(), own.copy()
-    for step in itertools.product((-1, 0, 1), repeat=3):
-        there = np.roll(height, step, (0, 1, 2))
-        higher = there > best
-        best[higher] = there[higher]
-        up[higher] = np.roll(own, step, (0, 1, 2))[higher]
-    top = up.ravel()
-    while not np.array_equal(top, higher_up := top[top]):
-        top = higher_up
-    _, basins = np.unique(np.where(inside, top.reshape(inside.shape), -1), return_inverse=True)
-    return basins.reshape(inside.shape).astype(np.int32), distance
-
-
-def _joined(basins: Labels, distance: F32, neck: float) -> Labels:
-    """Join basins with a wide neck between them; number the results 1, 2, ..."""
-    n = int(basins.max())
-    peak = np.zeros(n + 1)
-    np.maximum.at(peak, basins.ravel(), distance.ravel())
-    necks: dict[int, float] = {}
-    for axis in range(3):
-        low, high = (
-            tuple(slice(*ends) if a == axis else slice(None) for a in range(3)) for ends in ((0, -1), (1, None))
-        )
-        meet = (basins[low] != basins[high]) & (basins[low] > 0) & (basins[high] > 0)
-        one, other = basins[low][meet].astype(np.int64), basins[high][meet]
-        pair = np.minimum(one, other) * (n + 1) + np.maximum(one, other)
-        width = np.minimum(distance[low][meet], distance[high][meet])
-        keys, place = np.unique(pair, return_inverse=True)
-        widest = np.zeros(keys.size)
-        np.maximum.at(widest, place, width)
-        for key, value in zip(keys.tolist(), widest.tolist(), strict=True):
-            necks[key] = max(necks.get(key, 0.0), value)
-    root = np.arange(n + 1)
-    for key in sorted(necks, key=lambda key: -necks[key]):
-        a, b = root[key // (n + 1)], root[key % (n + 1)]
-        if a != b and necks[key] >= neck * min(peak[a], peak[b]) - _GRID:
-            peak[a] = max(peak[a], peak[b])
-            root[root == b] = a
-    _, numbered = np.unique(root, return_inverse=True)
-    return numbered[basins].astype(np.int32)

@@ -67,7 +67,6 @@ def surface(
         count: takes slices done and all.
 
     Raises:
-        ImportError: scikit-image is not installed.
         ValueError: no voxel, or every one, is above the level; some are not finite; or the mesh takes too much.
     """
     from skimage.measure import marching_cubes

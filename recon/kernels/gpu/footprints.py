@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.kernels.cpu.footprints import HIDDEN, INEXACT, NEAREST
@@ -29,6 +31,9 @@ _HUGE = tl.constexpr(3.0e38)
 _HIDDEN, _INEXACT = tl.constexpr(HIDDEN), tl.constexpr(INEXACT)
 # Columns of the footprint table, as in `cpu.footprints`.
 U, V, K, SHEAR, KV, W, HU, HV = (tl.constexpr(column) for column in range(8))
+# Of a view's `beam`: nine numbers of its axes, then its origin (col, row) and its centre (x, y, z).
+ORIGIN, _CENTRE = tl.constexpr(9), tl.constexpr(11)
+BEAM = 14
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +81,22 @@ def body(x, COMPACT: tl.constexpr):
 
 
 @triton.jit
-def along_ray(means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr):
+def axes_of(beam):
+    """The view's axes u, v and d."""
+    return (
+        tl.load(beam), tl.load(beam + 1), tl.load(beam + 2), tl.load(beam + 3), tl.load(beam + 4), tl.load(beam + 5),
+        tl.load(beam + 6), tl.load(beam + 7), tl.load(beam + 8),
+    )  # fmt: skip
+
+
+@triton.jit
+def along_ray(means, i, live, beam, focal, sod, CONE: tl.constexpr):
     """Position of a Gaussian in the view and the ray through it: (across, up, px/mm, a, b, depth, length of ray)."""
+    ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
     x, y = tl.load(means + 3 * i, live, 0.0), tl.load(means + 3 * i + 1, live, 0.0)
     z = tl.load(means + 3 * i + 2, live, 0.0)
+    if CONE:
+        x, y, z = x - tl.load(beam + _CENTRE), y - tl.load(beam + _CENTRE + 1), z - tl.load(beam + _CENTRE + 2)
     across, up = ux * x + uy * y + uz * z, vx * x + vy * y + vz * z
     if CONE:
         depth = sod + (dx * x + dy * y + dz * z)
@@ -157,16 +174,14 @@ def add_shape(
 
 @triton.jit(do_not_specialize=["n"])
 def _footprints(
-    means, scales, rotations, densities, table, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz, col0, row0,
-    focal, sod, near, faint, cut, fixed, worst, unit, e0, e1, e2, e3, CONE: tl.constexpr, COMPACT: tl.constexpr,
-    BLOCK: tl.constexpr,
+    means, scales, rotations, densities, table, boxes, n, rows, cols, beam, focal, sod, near, faint, cut, fixed,
+    worst, unit, e0, e1, e2, e3, CONE: tl.constexpr, COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     i = tl.minimum(i, n - 1)  # lanes past the end repeat the last Gaussian and store nothing
-    across, up, per, a, b, depth, norm = along_ray(
-        means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE
-    )  # fmt: skip
+    ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
+    across, up, per, a, b, depth, norm = along_ray(means, i, live, beam, focal, sod, CONE)
     zero = tl.zeros((BLOCK,), tl.float32)
     uu, uv, vv, hh, along_u, along_v = zero, zero, zero, zero, zero, zero
     for k in tl.static_range(3):
@@ -186,7 +201,7 @@ def _footprints(
     steep, level = high * scale, 1.0 / (high * per)
     ka, kv = steep * steep, level * level
     weight = tl.load(densities + i) * tl.where(fixed > 0.0, fixed, unit * norm * within)
-    u, v = col0 + per * across, row0 + per * up
+    u, v = tl.load(beam + ORIGIN) + per * across, tl.load(beam + ORIGIN + 1) + per * up
     # Comparisons with NaN are false, so Gaussians that are not finite are hidden.
     seen = live & (weight > faint) & (weight < _HUGE) & (ka < _HUGE) & (kv < _HUGE) & (depth > near)
     if COMPACT:
@@ -219,14 +234,15 @@ def _footprints(
 
 @triton.jit(do_not_specialize=["n"])
 def _footprints_backward(
-    means, scales, rotations, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
-    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, unit, CONE: tl.constexpr, BLOCK: tl.constexpr,
+    means, scales, rotations, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n, beam,
+    focal, sod, fixed, unit, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     f, m = table + 8 * i, moments + 6 * i
     seen = live & (tl.load(f + HU, live, -1.0) >= 0.0)
-    _, _, g, ax, ay, depth, norm = along_ray(means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE)
+    ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
+    _, _, g, ax, ay, depth, norm = along_ray(means, i, seen, beam, focal, sod, CONE)
     m0, mt, mv = tl.load(m, seen, 0.0), tl.load(m + 1, seen, 0.0), tl.load(m + 2, seen, 0.0)
     mtt, mtv, mvv = tl.load(m + 3, seen, 0.0), tl.load(m + 4, seen, 0.0), tl.load(m + 5, seen, 0.0)
     k, shear = tl.load(f + K, seen, 0.0), tl.load(f + SHEAR, seen, 0.0)
@@ -277,45 +293,50 @@ def _footprints_backward(
     add_to(d_means + 3 * i + 2, uz * tu + vz * tv + dz * td, seen)
 
 
-def beam_of(geometry: Geometry, view: int) -> tuple[list[float], float, float]:
-    """The view's axes (nine numbers), sdd in pixels (parallel beam: pixels per mm), and sod (parallel beam: 0)."""
+def beam_of(geometry: Geometry, view: int) -> F32:
+    """What kernels read of one view, float32 [14]: its axes, its origin (col, row) in pixels, its centre in mm."""
+    return np.array([*geometry.axes(view).ravel(), *geometry.origin(view), *geometry.centres[view]], np.float32)
+
+
+def lens_of(geometry: Geometry) -> tuple[float, float]:
+    """What all views share: sdd in pixels (parallel beam: pixels per mm), and sod (parallel beam: 0)."""
     focal = (geometry.sdd if geometry.is_cone else 1.0) / geometry.pixel_pitch
-    return geometry.axes(view).ravel().tolist(), focal, geometry.sod if geometry.is_cone else 0.0
+    return focal, geometry.sod if geometry.is_cone else 0.0
 
 
 def footprints(
-    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, view: int,
+    means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, geometry: Geometry, beam: Tensor,
     faint: float, cut: float, length: float = 0.0, exact_above: float = math.inf, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> Footprints:  # fmt: skip
-    """Footprints of Gaussians, cut off below `faint` (units of the image) and at `cut` σ, compact ones at their end.
+    """Footprints of Gaussians in the view of `beam`, see `beam_of`, cut off below `faint` (units of the image) and at
+    `cut` σ, compact ones at their end.
 
     A `length` (mm) other than 0 replaces μ: the uncorrected factor. Half widths are INEXACT, and boxes empty,
     where a cone's ε is above `exact_above` (see `cpu.footprints`).
     """
     n = densities.shape[0]
-    found = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
+    seen = Footprints(means.new_empty((n, 8)), torch.empty((n, 4), dtype=torch.int32, device=means.device))
     rows, cols = geometry.detector_shape
-    axes, focal, sod = beam_of(geometry, view)
+    focal, sod = lens_of(geometry)
     if n > 0:
         _footprints[(triton.cdiv(n, _BLOCK),)](
-            means, scales, rotations, densities, found.table, found.boxes, n, rows, cols, *axes, *geometry.origin(view),
-            focal, sod, NEAREST * sod, faint, kernel.reach(cut), length, min(exact_above * exact_above, _HUGE.value),
+            means, scales, rotations, densities, seen.table, seen.boxes, n, rows, cols, beam, focal, sod,
+            NEAREST * sod, faint, kernel.reach(cut), length, min(exact_above * exact_above, _HUGE.value),
             kernel.length, *kernel.affine_terms, CONE=geometry.is_cone, COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
-    return found
+    return seen
 
 
 def footprints_backward(
-    found: Footprints, moments: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
-    geometry: Geometry, view: int,
+    seen: Footprints, moments: Tensor, means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor,
+    geometry: Geometry, beam: Tensor,
     d_means: Tensor, d_log_scales: Tensor, d_rotations: Tensor, d_densities: Tensor, d_centres: Tensor,
     length: float = 0.0, kernel: Kernel = Kernel.GAUSSIAN,
 ) -> None:  # fmt: skip
     """Add to the gradients on means, log scales, rotations, densities; d_centres [n, 2]: ∂/∂(col, row) in 1/px."""
     n = densities.shape[0]
-    axes, focal, sod = beam_of(geometry, view)
     if n > 0:
         _footprints_backward[(triton.cdiv(n, _BLOCK),)](
-            means, scales, rotations, found.table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres,
-            n, *axes, focal, sod, length, kernel.length, CONE=geometry.is_cone, BLOCK=_BLOCK,
+            means, scales, rotations, seen.table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres,
+            n, beam, *lens_of(geometry), length, kernel.length, CONE=geometry.is_cone, BLOCK=_BLOCK,
         )  # fmt: skip

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from recon.base.kernel import Kernel
 from recon.kernels.gpu.footprints import HU, HV, KV, SHEAR, Footprints, K, U, V, W, scaled, shadow
-from recon.kernels.gpu.tiles import tile_lists
+from recon.kernels.gpu.tiles import Room, tile_lists
 
 _EDGE = 8  # pixels; footprints are mostly 9 to 15 wide, and larger tiles would evaluate more pixels outside them
 _GROUP = 8  # Gaussians that a tile processes at once
@@ -23,7 +23,7 @@ _MANY = 64  # footprints in one partial sum: adding many small numbers one by on
 _BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["shares"])
 def _render(
     table, owners, starts, layers, rows, cols, tile_cols, shares,
     EDGE: tl.constexpr, GROUP: tl.constexpr, MANY: tl.constexpr, COMPACT: tl.constexpr,
@@ -54,15 +54,17 @@ def _render(
     tl.store(layers + pixel, sums, (row < rows) & (col < cols))
 
 
-def render(found: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GAUSSIAN) -> Tensor:
+def render(
+    found: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GAUSSIAN, room: Room | None = None
+) -> Tensor:
     """Image [row, col]: the sum of the footprints."""
-    lists = tile_lists(found.boxes, shape, _EDGE)
+    lists = tile_lists(found.boxes, shape, _EDGE, room)
     layers = found.table.new_empty((lists.shares, *shape))
     _render[(lists.n_tiles, lists.shares)](
         found.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.shares,
         EDGE=_EDGE, GROUP=_GROUP, MANY=_MANY, COMPACT=kernel.is_compact, num_warps=2,
     )  # fmt: skip
-    return layers.sum(0)
+    return layers[0] if lists.shares == 1 else layers.sum(0)
 
 
 @triton.jit

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import triton
 import triton.language as tl
@@ -92,10 +94,11 @@ def _ssim_terms(
 
 @triton.jit
 def _combine(
-    image, target, half, weights, gradient, sums, window, rows, cols, pixels, soft, depth, share, ssim,
+    image, target, half, weights, gradient, sums, window, rows, cols, pixels, blocks, soft, depth, share, ssim,
     KIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Finish the blur of the derivatives and add those of the data term; sum w times that term of a block."""
+    """Finish the blur of the derivatives and add those of the data term; sum w times that term of a block, the squares
+    of w times the difference, and of w times the target."""
     block = tl.program_id(0)
     i = block * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -120,11 +123,14 @@ def _combine(
     slope = px + 2.0 * x * pxx + y * pxy
     if WEIGHTED:
         weight = tl.load(weights + i, live, 0.0)
+        off, y = off * weight, y * weight
         seen = weight > 0.0  # values in a pixel of weight 0 may overflow when squared
         pull, cost = tl.where(seen, pull * weight, 0.0), tl.where(seen, cost * weight, 0.0)
         slope = tl.where(seen, slope, 0.0)
     tl.store(gradient + i, share * pull - ssim * slope, live)
     tl.store(sums + block, tl.sum(cost))
+    tl.store(sums + blocks + block, tl.sum(off * off))
+    tl.store(sums + 2 * blocks + block, tl.sum(y * y))
 
 
 class GpuProjectionLoss:
@@ -138,7 +144,6 @@ class GpuProjectionLoss:
         self._blocks = triton.cdiv(self.pixels, _BLOCK)
         self._half = torch.empty((3, *shape), device=device)
         self._partials = torch.empty((3, *shape), device=device)
-        self._sums = torch.empty((2, self._blocks), device=device)
 
     def target_maps(self, target: Tensor, weights: Tensor | None = None) -> Tensor:
         """Blurred m y and m y² [2, row, col] of a target image, m where the weight is above 0."""
@@ -160,26 +165,32 @@ class GpuProjectionLoss:
 
         `target_maps` must have the same weights. Image and target must be finite also where the weight is 0.
         """
+        gradient, sums = self.slope(image, target, target_maps, weights)
+        return (sums[1] + self.ssim_weight * sums[0]) / self.pixels, gradient
+
+    def slope(
+        self, image: Tensor, target: Tensor, target_maps: Tensor, weights: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The gradient, and float64 sums [4]: w (1 - SSIM), w times the data term, squares of w times the difference
+        and of w times the target."""
         (rows, cols), pixels, grid = self.shape, self.pixels, (self._blocks,)
-        gradient = torch.empty_like(image)
-        unlike, data = self._sums
+        gradient, sums = torch.empty_like(image), image.new_empty((4, self._blocks))
         weighted = weights is not None
         w = image if weights is None else weights  # not read without weights
         _products_across[grid](
             image, target, w, self._half, self.window, cols, pixels, WEIGHTED=weighted, BLOCK=_BLOCK
         )  # fmt: skip
         _ssim_terms[grid](
-            self._half, target_maps, w, self._partials, unlike, self.window, rows, cols, pixels, *_C,
+            self._half, target_maps, w, self._partials, sums[0], self.window, rows, cols, pixels, *_C,
             WEIGHTED=weighted, BLOCK=_BLOCK,
         )  # fmt: skip
         _blur[(self._blocks, 3)](self._partials, self._half, self.window, rows, cols, pixels, ACROSS=True, BLOCK=_BLOCK)
         _combine[grid](
-            image, target, self._half, w, gradient, data, self.window, rows, cols, pixels, 1 / self.term.delta,
-            self.term.depth, 1 / pixels, self.ssim_weight / pixels, KIND=self.term.kind, WEIGHTED=weighted,
-            BLOCK=_BLOCK,
+            image, target, self._half, w, gradient, sums[1], self.window, rows, cols, pixels, self._blocks,
+            1 / self.term.delta, self.term.depth, 1 / pixels, self.ssim_weight / pixels,
+            KIND=self.term.kind, WEIGHTED=weighted, BLOCK=_BLOCK,
         )  # fmt: skip
-        sums = self._sums.sum(1, dtype=torch.float64)
-        return (sums[1] + self.ssim_weight * sums[0]) / pixels, gradient
+        return gradient, sums.sum(1, dtype=torch.float64)
 
 
 @triton.jit
@@ -207,18 +218,27 @@ def _total_variation(volume, gradient, sums, weight, nz, ny, nx, voxels, BLOCK: 
     _, back_x = _slope(here, tl.load(volume + i - 1, before_x, 0.0), before_x)
     _, back_y = _slope(here, tl.load(volume + i - nx, before_y, 0.0), before_y)
     _, back_z = _slope(here, tl.load(volume + i - stride_z, before_z, 0.0), before_z)
-    tl.store(gradient + i, weight * (slope_x + slope_y + slope_z + back_x + back_y + back_z), live)
+    slope = slope_x + slope_y + slope_z + back_x + back_y + back_z
+    tl.store(gradient + i, tl.load(weight) * slope, live)
     tl.store(sums + block, tl.sum(amount_x + amount_y + amount_z))
 
 
 def total_variation(volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """weight * mean |difference of neighbours| over the three axes (float64 scalar), and its gradient."""
-    nz, ny, nx = volume.shape
-    count = (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
-    gradient = torch.zeros_like(volume)
-    if count == 0:
-        return torch.zeros((), dtype=torch.float64, device=volume.device), gradient
+    per_pair = weight / max(1, neighbours(volume.shape))
+    total, gradient = variation(volume, torch.tensor(per_pair, dtype=torch.float32).to(volume.device))
+    return total * per_pair, gradient
+
+
+def neighbours(shape: Sequence[int]) -> int:
+    """Pairs of neighbours over the three axes of a volume [z, y, x]."""
+    nz, ny, nx = shape
+    return (nz - 1) * ny * nx + nz * (ny - 1) * nx + nz * ny * (nx - 1)
+
+
+def variation(volume: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """The sum of |difference of neighbours| (float64 scalar), and its gradient times a weight on the device."""
     blocks = triton.cdiv(volume.numel(), _BLOCK)
-    sums = volume.new_empty(blocks)
-    _total_variation[(blocks,)](volume, gradient, sums, weight / count, nz, ny, nx, volume.numel(), BLOCK=_BLOCK)
-    return sums.sum(dtype=torch.float64) * (weight / count), gradient
+    gradient, sums = torch.empty_like(volume), volume.new_empty(blocks)
+    _total_variation[(blocks,)](volume, gradient, sums, weight, *volume.shape, volume.numel(), BLOCK=_BLOCK)
+    return sums.sum(dtype=torch.float64), gradient

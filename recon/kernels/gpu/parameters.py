@@ -13,6 +13,7 @@ from recon.kernels.cpu.adam import BETA1, BETA2
 
 _BLOCK = 128
 _WIDEST = torch.finfo(torch.float32).max
+_EPS = 1e-15  # of Adam
 _SHORTEST = tl.constexpr(1e-12)  # a shorter quaternion counts as the identity
 _FARTHEST = tl.constexpr(87.0)  # largest |x| for which e^x is a normal float32 number
 
@@ -133,22 +134,32 @@ def _adam_one(parameter, gradient, first, second, rate, low, high, scale2, eps, 
     tl.store(parameter + i, tl.minimum(tl.maximum(value, low), high), live)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["size0", "size1", "size2", "size3"])
 def _adam(
-    p0, g0, m0, v0, rate0, low0, high0, size0, p1, g1, m1, v1, rate1, low1, high1, size1,
-    p2, g2, m2, v2, rate2, low2, high2, size2, p3, g3, m3, v3, rate3, low3, high3, size3,
-    scale2, eps, b1, b2, BLOCK: tl.constexpr,
+    p0, g0, m0, v0, low0, high0, size0, p1, g1, m1, v1, low1, high1, size1,
+    p2, g2, m2, v2, low2, high2, size2, p3, g3, m3, v3, low3, high3, size3,
+    rates, go, eps, b1, b2, GUARDED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     # One launch for all four arrays: the second axis of the grid says which.
     which = tl.program_id(1)
+    rate, scale2 = tl.load(rates + which), tl.load(rates + 4)
+    if GUARDED:
+        alive = tl.load(go)
+        size0, size1, size2, size3 = size0 * alive, size1 * alive, size2 * alive, size3 * alive
     if which == 0:
-        _adam_one(p0, g0, m0, v0, rate0, low0, high0, scale2, eps, b1, b2, size0, BLOCK)
+        _adam_one(p0, g0, m0, v0, rate, low0, high0, scale2, eps, b1, b2, size0, BLOCK)
     elif which == 1:
-        _adam_one(p1, g1, m1, v1, rate1, low1, high1, scale2, eps, b1, b2, size1, BLOCK)
+        _adam_one(p1, g1, m1, v1, rate, low1, high1, scale2, eps, b1, b2, size1, BLOCK)
     elif which == 2:
-        _adam_one(p2, g2, m2, v2, rate2, low2, high2, scale2, eps, b1, b2, size2, BLOCK)
+        _adam_one(p2, g2, m2, v2, rate, low2, high2, scale2, eps, b1, b2, size2, BLOCK)
     else:
-        _adam_one(p3, g3, m3, v3, rate3, low3, high3, scale2, eps, b1, b2, size3, BLOCK)
+        _adam_one(p3, g3, m3, v3, rate, low3, high3, scale2, eps, b1, b2, size3, BLOCK)
+
+
+def adam_rates(rates: Sequence[float], step: int) -> list[float]:
+    """What `adam_by` reads: the rates with the correction of the first moment at this step, from 1 on, and that of the
+    second."""
+    return [*(rate / (1 - BETA1**step) for rate in rates), 1 / (1 - BETA2**step)]
 
 
 def adam(
@@ -159,18 +170,51 @@ def adam(
     rates: Sequence[float],
     step: int,
     bounds: Sequence[tuple[float, float] | None],
-    eps: float = 1e-15,
 ) -> None:
     """Update four arrays and their moments in place (Kingma & Ba 2015, algorithm 1) and keep them within bounds.
 
     `step` counts from 1.
     """
-    scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
+    corrected = torch.tensor(adam_rates(rates, step), dtype=torch.float32).to(parameters[0].device)
+    adam_by(parameters, gradients, first, second, corrected, bounds)
+
+
+def adam_by(
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    rates: Tensor,
+    bounds: Sequence[tuple[float, float] | None],
+    go: Tensor | None = None,
+) -> None:
+    """`adam` with the five numbers of `adam_rates` on the device; it changes nothing where `go` is 0."""
     arguments: list[Tensor | float | int] = []
-    for p, g, m, v, rate, within in zip(parameters, gradients, first, second, rates, bounds, strict=True):
+    for p, g, m, v, within in zip(parameters, gradients, first, second, bounds, strict=True):
         low, high = (-_WIDEST, _WIDEST) if within is None else within
-        arguments += [p, g, m, v, rate * scale1, low, high, p.numel()]
+        arguments += [p, g, m, v, low, high, p.numel()]
     largest = max(p.numel() for p in parameters)
     if largest > 0:
         block = 4 * _BLOCK
-        _adam[(triton.cdiv(largest, block), 4)](*arguments, scale2, eps, BETA1, BETA2, BLOCK=block)
+        _adam[(triton.cdiv(largest, block), 4)](
+            *arguments, rates, rates if go is None else go, _EPS, BETA1, BETA2, GUARDED=go is not None, BLOCK=block
+        )  # fmt: skip
+
+
+@triton.jit(do_not_specialize=["n"])
+def _add_lengths(vectors, sums, go, factor, n, GUARDED: tl.constexpr, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    if GUARDED:
+        n = n * tl.load(go)
+    live = i < n
+    x, y = tl.load(vectors + 2 * i, live, 0.0), tl.load(vectors + 2 * i + 1, live, 0.0)
+    tl.store(sums + i, tl.load(sums + i, live, 0.0) + factor * tl.sqrt(x * x + y * y), live)
+
+
+def add_lengths(vectors: Tensor, factor: float, sums: Tensor, go: Tensor | None = None) -> None:
+    """sums [n] += factor |vectors [n, 2]|, unless `go` on the device is 0."""
+    n = sums.shape[0]
+    if n > 0:
+        _add_lengths[(triton.cdiv(n, _BLOCK),)](
+            vectors, sums, sums if go is None else go, factor, n, GUARDED=go is not None, BLOCK=_BLOCK
+        )  # fmt: skip

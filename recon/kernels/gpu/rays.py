@@ -18,6 +18,7 @@ from recon.base.kernel import Kernel
 from recon.kernels.gpu.footprints import (
     HU,
     KV,
+    ORIGIN,
     SHEAR,
     K,
     U,
@@ -25,9 +26,10 @@ from recon.kernels.gpu.footprints import (
     W,
     add_to,
     along_ray,
-    beam_of,
+    axes_of,
     footprints,
     footprints_backward,
+    lens_of,
     scaled,
     shadow,
     store_box,
@@ -47,15 +49,16 @@ _A, _BT, _BV, _BTT, _BTV, _BVV, _L, _LU, _LV, _N = (tl.constexpr(column) for col
 
 @triton.jit(do_not_specialize=["n"])
 def _terms(
-    means, scales, rotations, densities, table, terms, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz,
-    focal, sod, faint, cut, unit, COMPACT: tl.constexpr, BLOCK: tl.constexpr,
+    means, scales, rotations, densities, table, terms, boxes, n, rows, cols, beam, focal, sod, faint, cut, unit,
+    COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     i = tl.minimum(i, n - 1)  # lanes past the end repeat the last Gaussian and store nothing
     f, t = table + 8 * i, terms + _TERMS * i
     seen = live & (tl.load(f + HU) >= 0.0)
-    _, _, _, a, b, depth, norm = along_ray(means, i, seen, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, True)
+    ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
+    _, _, _, a, b, depth, norm = along_ray(means, i, seen, beam, focal, sod, True)
     zero = a * 0.0
     hh, along_u, along_v, broadest = zero, zero, zero, zero
     for k in tl.static_range(3):
@@ -110,13 +113,13 @@ def _at_pixels(du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT: tl.cons
 
 @triton.jit
 def _render(
-    table, terms, boxes, owners, starts, layers, rows, cols, tile_cols, shares, per, col0, row0, EDGE: tl.constexpr,
+    table, terms, boxes, owners, starts, layers, rows, cols, tile_cols, shares, per, beam, EDGE: tl.constexpr,
     GROUP: tl.constexpr, COMPACT: tl.constexpr,
 ):  # fmt: skip
     tile, share = tl.program_id(0), tl.program_id(1)
     lane = tl.arange(0, EDGE * EDGE)
     row, col = (tile // tile_cols) * EDGE + lane // EDGE, (tile % tile_cols) * EDGE + lane % EDGE
-    over, up = (col[None, :] - col0) * per, (row[None, :] - row0) * per
+    over, up = (col[None, :] - tl.load(beam + ORIGIN)) * per, (row[None, :] - tl.load(beam + ORIGIN + 1)) * per
     first, last = tl.load(starts + tile), tl.load(starts + tile + 1)
     member = tl.arange(0, GROUP)
     sums = tl.zeros((GROUP, EDGE * EDGE), tl.float32)
@@ -142,7 +145,7 @@ def _render(
 
 @triton.jit
 def _sums(
-    table, terms, boxes, gradient, sums, cols, per, col0, row0, HIGH: tl.constexpr, WIDE: tl.constexpr,
+    table, terms, boxes, gradient, sums, cols, per, beam, HIGH: tl.constexpr, WIDE: tl.constexpr,
     COMPACT: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0)
@@ -152,6 +155,7 @@ def _sums(
     au, av, eta, c2 = tl.load(t + _AU), tl.load(t + _AV), tl.load(t + _ETA), tl.load(t + _CUT)
     row_low, row_high, col_low, col_high = tl.load(box), tl.load(box + 1), tl.load(box + 2), tl.load(box + 3)
     lane = tl.arange(0, HIGH * WIDE)
+    col0, row0 = tl.load(beam + ORIGIN), tl.load(beam + ORIGIN + 1)
     s = tl.zeros((HIGH * WIDE,), tl.float32)
     bt, bv, btt, btv, bvv, sl, slu, slv, sn = s, s, s, s, s, s, s, s, s
     for row_start in range(row_low, row_high, HIGH):
@@ -189,8 +193,8 @@ def _sums(
 
 @triton.jit(do_not_specialize=["n"])
 def _bend(
-    means, scales, rotations, table, terms, boxes, sums, moments, d_means, d_log_scales, d_rotations, n,
-    ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, BLOCK: tl.constexpr,
+    means, scales, rotations, table, terms, boxes, sums, moments, d_means, d_log_scales, d_rotations, n, beam,
+    focal, sod, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Moments that give an affine footprint the same gradient through W, K and the centre; add the other parts."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -209,7 +213,8 @@ def _bend(
     tl.store(m + 4, per_w * tl.load(s + _BTV, hit, 0.0), live)
     tl.store(m + 5, per_w * tl.load(s + _BVV, hit, 0.0), live)
     # The gradient through α, η and |D₀|, which an affine footprint does not have.
-    _, _, _, a, b, depth, norm = along_ray(means, i, hit, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, True)
+    ux, uy, uz, vx, vy, vz, dx, dy, dz = axes_of(beam)
+    _, _, _, a, b, depth, norm = along_ray(means, i, hit, beam, focal, sod, True)
     hh = 1.0 / (eta * depth * depth)
     bent = eta * tl.load(s + _N, hit, 0.0)
     gau, gav = 2.0 * tl.load(s + _LU, hit, 0.0), 2.0 * tl.load(s + _LV, hit, 0.0)
@@ -241,23 +246,22 @@ class GpuRays:
     """Gaussians (one or more) in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(
-        self, parameters: tuple[Tensor, Tensor, Tensor, Tensor], geometry: Geometry, view: int, faint: float,
+        self, parameters: tuple[Tensor, Tensor, Tensor, Tensor], geometry: Geometry, beam: Tensor, faint: float,
         cut: float, kernel: Kernel = Kernel.GAUSSIAN,
     ) -> None:  # fmt: skip
         """Gaussians are cut off at `cut` standard deviations, and where no ray gets more than `faint` of them.
 
         `parameters` are means [n, 3], standard deviations [n, 3], rotations [n, 9] and densities [n].
         """
-        self.parameters, self.geometry, self.view = parameters, geometry, view
+        self.parameters, self.geometry, self.beam = parameters, geometry, beam
         means, _, _, densities = parameters
-        self.kernel, self.footprints = kernel, footprints(*self.parameters, geometry, view, faint, cut, kernel=kernel)
+        self.kernel, self.footprints = kernel, footprints(*self.parameters, geometry, beam, faint, cut, kernel=kernel)
         n = densities.shape[0]
-        axes, focal, sod = beam_of(geometry, view)
         self.terms = means.new_empty((n, _TERMS.value))
         self.boxes = torch.empty((n, 4), dtype=torch.int32, device=means.device)
         _terms[(triton.cdiv(n, _BLOCK),)](
-            *self.parameters, self.footprints.table, self.terms, self.boxes, n, *geometry.detector_shape, *axes, focal,
-            sod, faint, kernel.reach(cut), kernel.length, COMPACT=kernel.is_compact, BLOCK=_BLOCK,
+            *self.parameters, self.footprints.table, self.terms, self.boxes, n, *geometry.detector_shape, beam,
+            *lens_of(geometry), faint, kernel.reach(cut), kernel.length, COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
 
     def add_to(self, image: Tensor) -> None:
@@ -265,10 +269,10 @@ class GpuRays:
         shape = self.geometry.detector_shape
         lists = tile_lists(self.boxes, shape, _EDGE)
         layers = image.new_empty((lists.shares, *shape))
-        _, focal, _ = beam_of(self.geometry, self.view)
+        focal, _ = lens_of(self.geometry)
         _render[(lists.n_tiles, lists.shares)](
             self.footprints.table, self.terms, self.boxes, lists.owners, lists.starts, layers, *shape,
-            lists.counts[1], lists.shares, 1 / focal, *self.geometry.origin(self.view),
+            lists.counts[1], lists.shares, 1 / focal, self.beam,
             EDGE=_EDGE, GROUP=_GROUP, COMPACT=self.kernel.is_compact, num_warps=2,
         )  # fmt: skip
         image += layers.sum(0)
@@ -279,18 +283,18 @@ class GpuRays:
     ) -> None:  # fmt: skip
         """Add to the gradients; d_centres [n, 2] receives ∂/∂(col, row) of the footprint's centre in 1/px."""
         n, table = self.boxes.shape[0], self.footprints.table
-        axes, focal, sod = beam_of(self.geometry, self.view)
+        focal, sod = lens_of(self.geometry)
         high, wide = _PIXELS
         sums, moments = table.new_empty((n, 10)), table.new_empty((n, 6))
         _sums[(n,)](
-            table, self.terms, self.boxes, gradient, sums, gradient.shape[1], 1 / focal,
-            *self.geometry.origin(self.view), HIGH=high, WIDE=wide, COMPACT=self.kernel.is_compact, num_warps=1,
+            table, self.terms, self.boxes, gradient, sums, gradient.shape[1], 1 / focal, self.beam,
+            HIGH=high, WIDE=wide, COMPACT=self.kernel.is_compact, num_warps=1,
         )  # fmt: skip
         _bend[(triton.cdiv(n, _BLOCK),)](
             *self.parameters[:3], table, self.terms, self.boxes, sums, moments, d_means, d_log_scales, d_rotations, n,
-            *axes, focal, sod, BLOCK=_BLOCK,
+            self.beam, focal, sod, BLOCK=_BLOCK,
         )  # fmt: skip
         footprints_backward(
-            self.footprints, moments, *self.parameters, self.geometry, self.view,
+            self.footprints, moments, *self.parameters, self.geometry, self.beam,
             d_means, d_log_scales, d_rotations, d_densities, d_centres, kernel=self.kernel,
         )  # fmt: skip

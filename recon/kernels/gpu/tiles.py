@@ -1,6 +1,7 @@
 """tile_lists: the Gaussians that touch each tile of an image or brick of voxels, by counting and one sort.
 
-A pixel is a sum, so the order within a tile is free; a stable sort makes it the same in every run.
+A pixel is a sum, so the order within a tile is free; a stable sort makes it the same in every run. The length of the
+lists is the only number that the host needs: it reads it from the device, or takes that of a `Room`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,25 @@ from torch import Tensor
 PROGRAMS = 4096  # programs that keep a large device busy
 _BLOCK = 256
 _LEAST = 32  # Gaussians that a part of a list should hold at least
+_SPARE = 1.25  # length of a room over the pairs that were counted
+_SHORT = 2**15 - 1  # tiles that a 16-bit number holds, the one after the last included: half the passes of the sort
+
+
+@dataclass(eq=False)
+class Room:
+    """The length of lists that are filled again and again without waiting for the device.
+
+    Attributes:
+        needed: int64 scalar on the device: the most pairs that were needed; lists of more than `pairs` were cut.
+        pairs: the length; None until the first lists are counted, see `grow`.
+    """
+
+    needed: Tensor
+    pairs: int | None = None
+
+    def grow(self, pairs: int) -> None:
+        """Take a length with a quarter to spare, in whole blocks."""
+        self.pairs = _BLOCK * max(1, math.ceil(_SPARE * pairs / _BLOCK))
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +44,8 @@ class TileLists:
     """Gaussians tile by tile.
 
     Attributes:
-        owners: int32 [pairs], indices of Gaussians; those of tile t are owners[starts[t]:starts[t + 1]].
+        owners: int32 [pairs], indices of Gaussians; those of tile t are owners[starts[t]:starts[t + 1]]. In a room,
+            what follows the last tile's is without meaning.
         starts: int32 [tiles + 1]; tiles are numbered row-major.
         counts: tiles along each axis.
     """
@@ -55,52 +76,80 @@ def _touched(boxes, touched, n, edge, AXES: tl.constexpr, BLOCK: tl.constexpr):
     tl.store(touched + i, tiles, i < n)
 
 
-@triton.jit(do_not_specialize=["pairs"])
+@triton.jit(do_not_specialize=["n", "pairs", "halvings"])
 def _tile_of_pairs(
-    boxes, owners, ends, tiles, pairs, edge, tiles_y, tiles_x, AXES: tl.constexpr, BLOCK: tl.constexpr
+    boxes, ends, owners, tiles, needed, n, pairs, halvings, edge, tiles_y, tiles_x, n_tiles,
+    AXES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """The tile of each pair of a Gaussian and a tile that it touches, int32 [pairs]."""
+    """Owner and tile of each pair of a Gaussian and a tile that it touches, int32 [pairs] and [pairs]; `n_tiles` for
+    the tile of pairs that there are not."""
     pair = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    held = pair < pairs
-    owner = tl.load(owners + pair, held, 0)
+    low, high = tl.zeros((BLOCK,), tl.int32), tl.zeros((BLOCK,), tl.int32) + n
+    for _ in range(halvings):  # the first Gaussian whose pairs end behind this one
+        middle = (low + high) // 2
+        before = (middle < n) & (tl.load(ends + middle, middle < n, 0) <= pair)
+        low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
+    owner, held = low, (low < n) & (pair < pairs)
     rank = (tl.load(ends + owner, held, 1) - 1 - pair).to(tl.int32)  # from the last tile of the box to the first
     tile, stride = tl.zeros((BLOCK,), tl.int32), 1
     for back in tl.static_range(AXES):
         axis = AXES - 1 - back
-        low = tl.load(boxes + 2 * (AXES * owner + axis), held, 0)
-        high = tl.load(boxes + 2 * (AXES * owner + axis) + 1, held, 1)
-        first = low // edge
-        span = tl.maximum((high - 1) // edge - first + 1, 1)
+        first_of_box = tl.load(boxes + 2 * (AXES * owner + axis), held, 0)
+        end_of_box = tl.load(boxes + 2 * (AXES * owner + axis) + 1, held, 1)
+        first = first_of_box // edge
+        span = tl.maximum((end_of_box - 1) // edge - first + 1, 1)
         tile += (first + rank % span) * stride
         rank = rank // span
         stride *= tiles_x if back == 0 else tiles_y
-    tl.store(tiles + pair, tile, held)
+    tl.store(owners + pair, owner, pair < pairs)
+    tl.store(tiles + pair, tl.where(held, tile, n_tiles), pair < pairs)
+    if tl.program_id(0) == 0:
+        tl.store(needed, tl.maximum(tl.load(needed), tl.load(ends + n - 1)))
 
 
-def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int) -> TileLists:
+@triton.jit(do_not_specialize=["pairs", "halvings"])
+def _starts(tiles, starts, pairs, halvings, n_tiles, BLOCK: tl.constexpr):
+    """The first of the sorted pairs that is not of an earlier tile, int32 [n_tiles + 1]."""
+    tile = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    low, high = tl.zeros((BLOCK,), tl.int32), tl.zeros((BLOCK,), tl.int32) + pairs
+    for _ in range(halvings):
+        middle = (low + high) // 2
+        before = (middle < pairs) & (tl.load(tiles + middle, middle < pairs, 0) < tile)
+        low, high = tl.where(before, middle + 1, low), tl.where(before, high, middle)
+    tl.store(starts + tile, low, tile <= n_tiles)
+
+
+def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int, room: Room | None = None) -> TileLists:
     """Lists for boxes int32 [n, 2 * axes] (low, high of each axis, high excluded, inside `shape`), tiles of `edge`.
 
     Raises:
         MemoryError: where there are 2^31 or more pairs of a Gaussian and a tile.
     """
     counts, n, device = tuple(-(-size // edge) for size in shape), len(boxes), boxes.device
+    n_tiles = math.prod(counts)
     touched = torch.empty(n, dtype=torch.int64, device=device)
     if n > 0:
         _touched[(triton.cdiv(n, _BLOCK),)](boxes, touched, n, edge, AXES=len(counts), BLOCK=_BLOCK)
     ends = touched.cumsum(0)
-    pairs = int(ends[-1]) if n > 0 else 0  # the only number read from the device: the length of the lists
+    if room is not None and room.pairs is not None:
+        pairs, needed = room.pairs, room.needed
+    else:
+        pairs, needed = int(ends[-1]) if n > 0 else 0, touched.new_zeros(())
+        if room is not None:
+            room.grow(pairs)
     if pairs >= 2**31:
         raise MemoryError(
             f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than lists hold (2^31); "
             "take a smaller image or grid, or fewer or smaller Gaussians"
         )
-    tile = torch.empty(pairs, dtype=torch.int32, device=device)
-    owners = torch.searchsorted(ends, torch.arange(pairs, device=device), right=True, out_int32=True)
+    owners = torch.empty(pairs, dtype=torch.int32, device=device)
+    tile = torch.empty(pairs, dtype=torch.int16 if n_tiles < _SHORT else torch.int32, device=device)
     if pairs > 0:
         _tile_of_pairs[(triton.cdiv(pairs, _BLOCK),)](
-            boxes, owners, ends, tile, pairs, edge, counts[-2], counts[-1], AXES=len(counts), BLOCK=_BLOCK,
+            boxes, ends, owners, tile, needed, n, pairs, n.bit_length(), edge, counts[-2], counts[-1], n_tiles,
+            AXES=len(counts), BLOCK=_BLOCK,
         )  # fmt: skip
     tile, order = torch.sort(tile, stable=True)
-    edges = torch.arange(math.prod(counts) + 1, device=device, dtype=torch.int32)
-    starts = torch.searchsorted(tile, edges, out_int32=True)
+    starts = torch.empty(n_tiles + 1, dtype=torch.int32, device=device)
+    _starts[(triton.cdiv(n_tiles + 1, _BLOCK),)](tile, starts, pairs, pairs.bit_length(), n_tiles, BLOCK=_BLOCK)
     return TileLists(owners[order], starts, counts)

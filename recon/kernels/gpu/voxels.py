@@ -21,7 +21,7 @@ from torch import Tensor
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.kernels.gpu.footprints import add_shape, add_to, body, scaled, shape_of
-from recon.kernels.gpu.tiles import tile_lists
+from recon.kernels.gpu.tiles import Room, tile_lists
 
 _BLOCK = 128
 _EDGE = 8  # voxels a brick edge
@@ -45,7 +45,7 @@ class Placed:
 
 @triton.jit(do_not_specialize=["n"])
 def _placed(
-    means, scales, rotations, densities, table, boxes, n, x0, y0, z0, per_x, per_z, nx, ny, nz, faint, cut,
+    means, scales, rotations, densities, table, boxes, n, corner, per_x, per_z, nx, ny, nz, faint, cut,
     COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -72,9 +72,9 @@ def _placed(
         reach = cut
     else:
         reach = tl.minimum(cut, tl.sqrt(2.0 * tl.maximum(tl.log(tl.where(seen, density, 1.0) / faint), 0.0)))
-    x = (tl.load(means + 3 * i) - x0) * per_x
-    y = (tl.load(means + 3 * i + 1) - y0) * per_x
-    z = (tl.load(means + 3 * i + 2) - z0) * per_z
+    x = (tl.load(means + 3 * i) - tl.load(corner)) * per_x
+    y = (tl.load(means + 3 * i + 1) - tl.load(corner + 1)) * per_x
+    z = (tl.load(means + 3 * i + 2) - tl.load(corner + 2)) * per_z
     hx, hy, hz = reach * tl.sqrt(xx), reach * tl.sqrt(yy), reach * tl.sqrt(zz)
     f = table + _WIDTH * i
     tl.store(f + X, x, live)
@@ -108,11 +108,15 @@ def _placed(
 
 def place(
     means: Tensor, scales: Tensor, rotations: Tensor, densities: Tensor, grid: Grid, faint: float, cut: float,
-    kernel: Kernel = Kernel.GAUSSIAN,
+    kernel: Kernel = Kernel.GAUSSIAN, corner: Tensor | None = None,
 ) -> Placed:  # fmt: skip
-    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ, compact ones at their end."""
+    """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ, compact ones at their end.
+
+    `corner` (x, y, z) on the device replaces the centre of the grid's first voxel.
+    """
     n = densities.shape[0]
-    z, y, x = grid.first
+    if corner is None:
+        corner = torch.tensor(grid.first[::-1], dtype=torch.float32).to(means.device)
     nz, ny, nx = grid.shape
     edge_z, _, edge_x = grid.spacing
     placed = Placed(
@@ -120,13 +124,13 @@ def place(
     )
     if n > 0:
         _placed[(triton.cdiv(n, _BLOCK),)](
-            means, scales, rotations, densities, placed.table, placed.boxes, n, x, y, z, 1 / edge_x, 1 / edge_z,
+            means, scales, rotations, densities, placed.table, placed.boxes, n, corner, 1 / edge_x, 1 / edge_z,
             nx, ny, nz, faint, kernel.reach(cut), COMPACT=kernel.is_compact, BLOCK=_BLOCK,
         )  # fmt: skip
     return placed
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["shares"])
 def _fill(
     table, owners, starts, layers, nz, ny, nx, bricks_y, bricks_x, shares, EDGE: tl.constexpr, GROUP: tl.constexpr,
     COMPACT: tl.constexpr,
@@ -156,10 +160,10 @@ def _fill(
     tl.store(layers + voxel, tl.sum(sums, axis=0), (iz < nz) & (iy < ny) & (ix < nx))
 
 
-def fill(placed: Placed) -> Tensor:
+def fill(placed: Placed, room: Room | None = None) -> Tensor:
     """Density [z, y, x] at the voxel centres."""
     shape = placed.grid.shape
-    lists = tile_lists(placed.boxes, shape, _EDGE)
+    lists = tile_lists(placed.boxes, shape, _EDGE, room)
     layers = placed.table.new_empty((lists.shares, *shape))
     _fill[(lists.n_tiles, lists.shares)](
         placed.table, lists.owners, lists.starts, layers, *shape, lists.counts[1], lists.counts[2], lists.shares,

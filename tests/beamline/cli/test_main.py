@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,6 @@ from click.testing import CliRunner
 from beamline.cli import main as module
 from beamline.core import errors
 from beamline.core.errors import INTERRUPTED, leave_traceback, user_message
-from beamline.features.completion import command as man
 from drivers.base.errors import DeviceError, DeviceTimeout
 
 
@@ -120,6 +118,13 @@ def test_unknown_words_are_usage(arguments: list[str]) -> None:
     assert "nonsense" in result.stderr
 
 
+@pytest.mark.parametrize("threads", ["0", "-1", "many"])
+def test_a_number_of_threads_that_cannot_be_is_usage(monkeypatch: pytest.MonkeyPatch, threads: str) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
+    done = CliRunner().invoke(module.main, ["info", "x.h5"])
+    assert done.exit_code == 2 and f"NUMBA_NUM_THREADS={threads} in the environment" in done.stderr
+
+
 def test_help_names_every_command() -> None:
     shown = CliRunner().invoke(module.main, ["--help"]).stdout
     for name in module.LazyGroup().list_commands(click.Context(module.main)):
@@ -191,34 +196,6 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     monkeypatch.setattr(module, "import_module", None)
     assert completed("re") == ["resume", "recon", "recover", "render"]
     assert completed("--v") == ["--version"]
-
-
-@pytest.mark.parametrize("words", [[], ["scan"], ["recon"], ["config"]])
-def test_a_manual_page_has_what_the_help_has(words: list[str]) -> None:
-    printed = CliRunner().invoke(module.main, ["man", *words])
-    assert (printed.exit_code, printed.stderr) == (0, "")
-    page = printed.stdout.replace("\\-", "-").replace("\\:", "")
-    command = module.main.get_command(click.Context(module.main), words[0]) if words else module.main
-    assert command is not None
-    context = click.Context(command)
-    for option in (param for param in command.get_params(context) if isinstance(param, click.Option)):
-        record = option.get_help_record(context)
-        assert record is None or f".B {record[0]}\n" in page
-    assert "\n130  interrupted" in page and ".B NO_COLOR" in page
-    sections = [line.removeprefix(".SH ") for line in page.splitlines() if line.startswith(".SH")]
-    assert sections[:4] == ["NAME", "SYNOPSIS", "DESCRIPTION", "OPTIONS"]
-    assert ("COMMANDS" in sections) is isinstance(command, click.Group)
-    if (groff := shutil.which("groff")) is not None:
-        said = subprocess.run([groff, "-ww", "-man", "-Tutf8"], input=printed.stdout, capture_output=True, text=True)
-        assert (said.returncode, said.stderr) == (0, "")
-
-
-def test_text_of_a_manual_page_is_never_a_request() -> None:
-    assert [man._text(text) for text in (".sp 99", "'a", "C:\\x", "--y")] == ["\\&.sp 99", "\\&'a", "C:\\ex", "\\-\\-y"]
-
-
-def test_a_manual_page_of_no_command_is_refused() -> None:
-    assert CliRunner().invoke(module.main, ["man", "nothing"]).exit_code == 2
 
 
 def test_an_interruption_that_went_through_a_text_of_code_has_its_exit_code_too() -> None:

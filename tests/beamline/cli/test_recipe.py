@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.cli import log
+from beamline.cli import recon as log
 from beamline.cli.recipe import repeating
 from beamline.features.particles.command import segment
 from beamline.features.trials.study_command import study

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from recon.methods import taking, with_trait
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import BEAM, DARK, write_exchange
 
@@ -149,7 +150,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
-MODELS = "r2, naf, intratomo, sax-nerf, r2-published"
+MODELS = ", ".join(taking("steps"))
 OTHER_TAKERS = {
     "--device": f"auto, {MODELS}", "--budget": "auto, r2, fista-tv, os-sirt-tv",
     "--steps": MODELS,
@@ -161,7 +162,7 @@ OTHER_TAKERS = {
 def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:
     result = beamline("recon", "scan.h5", "-m", method, *option.split())
     assert result.exit_code == 2 and result.stdout == ""
-    takers = OTHER_TAKERS.get(option.split()[0], "r2, r2-published")
+    takers = OTHER_TAKERS.get(option.split()[0], ", ".join(with_trait("checkpoints")))
     assert f"{option.split()[0]} is of {takers}; it does not go with --method {method}." in result.stderr
     assert left(folder) == {"scan.h5"}
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from beamline.core.events import KINDS, LONGEST, event_in, event_of, whole_lines
-from beamline.features.epics.ioc import ProcessVariables, StampedValues
+from beamline.page.followed_run import RunValues, StampedValues
 
 LINES = Path(__file__).with_name("event_lines.jsonl").read_text(encoding="utf-8").splitlines()
 
@@ -21,7 +21,7 @@ def test_a_line_that_was_recorded_is_written_as_it_was(line: str) -> None:
 
 
 def test_lines_of_nearly_every_kind_were_recorded() -> None:
-    rare = {"bench", "bench_started", "check", "enough"}  # minutes of work, or a goal that a short scan does not reach
+    rare = {"check", "enough"}  # minutes of work, or a goal that a short scan does not reach
     assert KINDS.keys() - {json.loads(line)["event"] for line in LINES} <= rare
 
 
@@ -59,8 +59,8 @@ def test_no_value_in_any_field_ends_who_reads_a_log(line: str) -> None:
     values = json.loads(line)
     for name in values:
         for junk in JUNK:
-            StampedValues(ProcessVariables(), 0.0).after([json.dumps({**values, name: junk})])
-        StampedValues(ProcessVariables(), 0.0).after([json.dumps({key: values[key] for key in values if key != name})])
+            StampedValues(RunValues(), 0.0).after([json.dumps({**values, name: junk})])
+        StampedValues(RunValues(), 0.0).after([json.dumps({key: values[key] for key in values if key != name})])
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,9 @@ from beamline.projections.corrections.counts import CountModel
 from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.rings.rings import Rings
-from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
 from beamline.projections.selection import Selection
-from beamline.projections.step import StepDone, key_of, option, options_of
-from beamline.projections.steps import step as old
+from beamline.projections.step import StepDone, key_of, options_of
 
 
 def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:
@@ -37,11 +35,6 @@ def test_a_selection_takes_one_step_of_a_kind() -> None:
     assert selection.steps == (Air("none"), Rings("vo"))
     assert (selection.step(Rings).way, selection.step(Phase)) == ("vo", Phase())
     assert [step.name for step in in_order(selection)] == [step.name for step in all_steps()]
-
-
-def test_a_plug_in_finds_the_names_where_they_were() -> None:
-    assert (old.option, old.StepDone, old.ScanPart) == (option, StepDone, ScanPart)
-    assert all(hasattr(old, name) for name in old.__all__)
 
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:

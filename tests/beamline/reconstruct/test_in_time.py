@@ -24,8 +24,8 @@ from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.features.neural.methods import NAF
-from recon.prep.correct import Projections
 from recon.splatting.r2 import R2
+from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
 
@@ -36,11 +36,7 @@ SWEEP = 10.0  # s
 
 
 def _prepared() -> PreparedProjections:
-    shape = (VIEWS.n_views, *VIEWS.detector_shape)
-    mask = np.zeros(VIEWS.detector_shape, bool)
-    ones = np.ones(VIEWS.n_views, np.float32)
-    lines = Projections(np.ones(shape, np.float32), np.arange(VIEWS.n_views), 0.0, ones, mask)
-    return PreparedProjections(lines, VIEWS, 19.5, None, None, VIEWS.n_views, "px", "counts")
+    return prepared_views(np.ones((VIEWS.n_views, *VIEWS.detector_shape), np.float32), VIEWS)
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from beamline.reconstruct.measure import contrast_by, fit_truth, measure, measur
 from recon.assess.metrics import ssim_of_whole_slices
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.prep.correct import Projections
 from recon.voxels.projector import project
+from tests.beamline.prepared_views import prepared_views
 
 DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
 
@@ -73,11 +73,7 @@ def _prepared(volume: Volume, held_out: bool = False) -> PreparedProjections:
     rows, _, cols = volume.grid.shape
     geometry = Geometry.parallel(np.linspace(0, 3, 20), (rows, cols))
     data = project(volume, geometry)
-    mask = np.zeros((rows, cols), bool)
-    projections = Projections(data, np.arange(20), 0.0, np.ones(20, np.float32), mask)
-    return PreparedProjections(
-        projections, geometry, 0.0, None, (data, geometry) if held_out else None, 20, "mm", "counts"
-    )
+    return prepared_views(data, geometry, held_out=(data, geometry) if held_out else None)
 
 
 def _ball() -> Volume:

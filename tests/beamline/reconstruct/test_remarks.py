@@ -12,12 +12,12 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import measure, uniform_residual
 from beamline.reconstruct.remarks import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
-from recon.base.method import Reconstruction
+from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.prep.correct import Projections
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.projector import project
 from recon.voxels.stray_mass import stray_mass
+from tests.beamline.prepared_views import prepared_views
 
 FIRST_FRAME, FIRST_ROW = 20, 30
 
@@ -33,10 +33,9 @@ def _made(
     data = project(volume, geometry) + rng.normal(0, 0.02, (40, 24, 48)).astype(np.float32)
     for view, height in specks.items():
         data[view, 10:14, 22:26] += height
-    frames = FIRST_FRAME + np.arange(40)
-    projections = Projections(data, frames, 0.0, np.ones(40, np.float32), np.zeros((24, 48), bool))
-    prepared = PreparedProjections(projections, geometry, 0.0, None, None, 40, "mm", "counts")
-    return Reconstruction(volume, {}, method=method, seconds=1.0), prepared
+    prepared = prepared_views(data, geometry)
+    frames = replace(prepared.projections, view_ids=FIRST_FRAME + np.arange(40))
+    return Reconstruction(volume, {}, method=method, seconds=1.0), replace(prepared, projections=frames)
 
 
 def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:
@@ -80,7 +79,7 @@ def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> Non
 def test_a_volume_that_was_stopped_is_not_compared(rng: np.random.Generator) -> None:
     made, prepared = _made(rng, {7: 0.5}, "sirt")
     assert odd_views_warning(made, prepared, Selection())
-    assert odd_views_warning(replace(made, settings={"ended_early": True}), prepared, Selection()) == ""
+    assert odd_views_warning(replace(made, ending=Ending(early=True)), prepared, Selection()) == ""
 
 
 @pytest.mark.parametrize(("method", "specks"), [("sirt", {}), ("fbp", {7: 0.5})])

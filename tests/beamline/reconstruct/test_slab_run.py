@@ -144,7 +144,7 @@ def test_other_data_or_options_are_refused_and_nothing_is_touched(
         ("--seed", "3"): "seed (3, 0 in the file)",
         ("--tv-weight", "0.01"): "tv_weight (0.01, 0.002 in the file)",
         ("--air", "none"): "projections (other content)",
-        ("--rows", "0:80"): "detector_shape ([80, 32], [96, 32] in the file)",
+        ("--rows", "0:80"): "is of 96 slices, this volume has 80",
         ("--memory", "3.5M"): "Give --memory 5M if",
     }.items():
         refused = beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5", *options)

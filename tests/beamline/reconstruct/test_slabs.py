@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tracemalloc
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -161,11 +160,12 @@ def test_what_does_not_fit_is_refused_before_the_work(tmp_path: Path) -> None:
 
 
 def test_what_is_needed_grows_with_the_scan() -> None:
-    full = ReconMemory.of(Fbp(), 1800, (2048, 2048), 2)
+    views = Geometry.parallel(np.linspace(0, np.pi, 1800, endpoint=False), (2048, 2048))
+    full = ReconMemory(Fbp(), views, 2 * 1800 * 2048**2, False)
     assert full.line_integrals == 1800 * 2048**2 * 4 and full.volume == 2048**3 * 4
     assert 60e9 < full.at_once < 90e9
     assert full.least < 4e9 and full.slab(full.height(8_000_000_000)) < 8e9
-    tv = replace(ReconMemory.of(OsSirtTv(), 1800, (2048, 2048), 2), weighted=False)
+    tv = ReconMemory(OsSirtTv(), views, 2 * 1800 * 2048**2, False)
     assert 64 <= tv.height(32_000_000_000) < 256 and tv.slab(tv.height(32_000_000_000)) < 32e9
 
 
@@ -182,6 +182,23 @@ def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) ->
     result = beamline("recon", "scan.h5", "-m", "fbp", "--memory", "1M", "--dry-run")
     assert result.exit_code == 5 and "Give --memory 3M" in result.stderr
     assert left(tmp_path) == {"scan.h5"}
+
+
+@pytest.mark.usefixtures("tall")
+@pytest.mark.parametrize(
+    "words", ["--memory 1M", "--memory 3M", "--memory 1G", "--memory 3M --calibrate axis,tilt", "--memory 3M --bin 2"]
+)
+def test_a_run_follows_the_plan_of_its_dry_run(words: str) -> None:
+    """It is refused with the same words, or is made in as many slabs."""
+    given = ("recon", "scan.h5", "-m", "fbp", "--no-report", *words.split(), "-o", "out.h5")
+    dry, run = beamline(*given, "--dry-run", "--json"), beamline(*given)
+    assert dry.exit_code == run.exit_code
+    told = json.loads(dry.stdout.splitlines()[-1])
+    if run.exit_code:
+        assert str(told["message"]) in " ".join(run.stderr.split())
+        return
+    made = read_reconstruction(Path("out.h5")).parameters
+    assert told["slabs"] == int(str(made.get("slabs", 1)))
 
 
 @pytest.mark.usefixtures("tall")

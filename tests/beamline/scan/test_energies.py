@@ -16,7 +16,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.config.load import config_folder, load
-from beamline.features.doctor.disk import needs
+from beamline.features.doctor.examine import needs
 from beamline.scan.preflight import dry_run
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume

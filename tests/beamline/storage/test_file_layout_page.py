@@ -35,7 +35,7 @@ from tests.clock import SteppedClock
 SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
 NOT_OF_EVERY_RUN = {
     "scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html", "watchdog.log",
-    "control/", "scan.h5.journal", "scan.h5.damaged",
+    "control/", "scan.h5.damaged",
 }  # fmt: skip
 """Of simulated scans, the live reconstruction and the watchdog, whose own tests name them; and of a scan that runs or
 ends."""

@@ -127,7 +127,7 @@ import os, sys
 from pathlib import Path
 from beamline.config.load import load
 from beamline.core.errors import DataError
-from beamline.features.doctor.disk import locks
+from beamline.features.doctor.examine import locks
 from beamline.scan.preflight import dry_run
 from beamline.features.files.describe import describe
 from beamline.storage.writers.layout import ScanInfo

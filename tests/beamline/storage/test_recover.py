@@ -20,11 +20,9 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
-from beamline.storage.overlay import Overlay
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover
-from beamline.storage.superblock import lookup3, superblock
-from beamline.storage.torn import block_size
+from beamline.storage.superblock import block_size, lookup3, superblock
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout, nxtomo
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -202,7 +200,7 @@ def test_a_block_that_a_kill_left_half_written_is_made_whole(
         for torn in _torn(before, path.read_bytes()) if k else ():
             died.write_bytes(torn)
             with monkeypatch.context() as patched, pytest.raises(DataError, match="checksum"):
-                patched.setattr("beamline.storage.recover.WholeBlocks", Overlay)
+                patched.setattr("beamline.storage.overlay.made_whole", lambda at, read: None)
                 recover(_aged(died))
             with open_scan(died) as source:  # while HDF5 itself would wait for ever for a writer to end the block
                 assert source.image_key.size == k

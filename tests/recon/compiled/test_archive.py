@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from recon.compiled import ROOT
-from recon.compiled.archive import archive_of, fresh_members, member, read_sources, source_files, unpack, write_archive
+from recon.compiled import ROOT, archive
+from recon.compiled.archive import (
+    archive_of,
+    carried,
+    fresh_members,
+    member,
+    read_sources,
+    sealed,
+    source_files,
+    unsealed,
+    write_archive,
+)
 from recon.compiled.level import level_for, processor_flags
 
 ARCHIVE = archive_of(sys.version_info[:2])
@@ -36,10 +48,6 @@ def _project(root: Path) -> Path:
     return archive
 
 
-def _unpacked(root: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in (root / "package").glob("__pycache__/*")}
-
-
 @pytest.mark.skipif(not ARCHIVE.is_file(), reason="no archive for this Python")
 def test_the_archive_is_current() -> None:
     """Else these kernels compile for every user: rebuild it with  python -m recon.compiled."""
@@ -53,23 +61,12 @@ def test_the_archive_names_what_kernels_are_compiled_from() -> None:
     assert "recon/base/kernel.py" in sources
 
 
-def test_kernels_are_unpacked_beside_their_module(tmp_path: Path) -> None:
-    archive = _project(tmp_path)
-    unpack(archive, tmp_path)
-    assert _unpacked(tmp_path) == FILES
-    (tmp_path / "package/__pycache__/scaled.scaled-5.py311.nbi").write_bytes(b"what numba added")
-    unpack(archive, tmp_path)
-    assert _unpacked(tmp_path)["scaled.scaled-5.py311.nbi"] == b"what numba added"  # once
-
-
 @pytest.mark.parametrize("edited", ["scaled.py", "helper.py"])
-def test_an_edited_source_leaves_its_kernels_packed(tmp_path: Path, edited: str) -> None:
+def test_an_edited_source_leaves_its_kernels_unused(tmp_path: Path, edited: str) -> None:
     archive = _project(tmp_path)
     with (tmp_path / "package" / edited).open("a", encoding="utf-8") as file:
         file.write("# edited\n")
     assert not list(fresh_members(archive, tmp_path))
-    unpack(archive, tmp_path)
-    assert not _unpacked(tmp_path)
 
 
 def test_the_same_kernels_make_the_same_archive(tmp_path: Path) -> None:
@@ -80,26 +77,102 @@ def test_the_same_kernels_make_the_same_archive(tmp_path: Path) -> None:
     assert member(archive, "package.scaled") == FILES
 
 
-def test_a_damaged_archive_is_a_miss(tmp_path: Path) -> None:
-    """Wherever it is damaged, nothing fails and no half of a file is left."""
-    archive = _project(tmp_path)
-    whole = archive.read_bytes()
+@pytest.fixture
+def carrying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The archive of a project whose kernels are asked for."""
+    archive_file = _project(tmp_path)
+    monkeypatch.setattr(archive, "archive_of", lambda python: archive_file)
+    monkeypatch.setattr(archive, "ROOT", tmp_path)
+    _forget()
+    yield archive_file
+    _forget()
+
+
+def _forget() -> None:
+    archive.carried.cache_clear()
+    archive._carried_modules.cache_clear()
+
+
+def test_kernels_are_found_by_the_digest_of_their_source(carrying: Path, tmp_path: Path) -> None:
+    stamp = hashlib.sha256((tmp_path / "package/scaled.py").read_bytes()).digest()
+    assert carried(stamp) == FILES
+    assert carried(hashlib.sha256(b"edited").digest()) == {}
+
+
+def test_a_damaged_archive_is_a_miss(carrying: Path, tmp_path: Path) -> None:
+    """Wherever it is damaged, nothing fails, and what is found is right."""
+    whole, stamp = carrying.read_bytes(), hashlib.sha256((tmp_path / "package/scaled.py").read_bytes()).digest()
     for at in range(0, len(whole), 7):
         for damaged in (whole[:at], whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :]):
-            archive.write_bytes(damaged)
-            (tmp_path / "__pycache__/kernels.unpacked").unlink(missing_ok=True)
-            unpack(archive, tmp_path)
-            assert _unpacked(tmp_path).items() <= FILES.items()
-            for path in (tmp_path / "package").glob("__pycache__/*"):
-                path.unlink()
+            carrying.write_bytes(damaged)
+            _forget()
+            assert carried(stamp).items() <= FILES.items()
+    carrying.unlink()
+    _forget()
+    assert carried(stamp) == {}
 
 
-def test_a_missing_archive_and_a_folder_that_cannot_be_written_are_a_miss(tmp_path: Path) -> None:
-    archive = _project(tmp_path)
-    (tmp_path / "package/__pycache__").write_text("a file where the folder would be", encoding="utf-8")
-    unpack(archive, tmp_path)
-    archive.unlink()
-    unpack(archive, tmp_path)
+@pytest.mark.parametrize("at", [0, 50, -1])
+def test_a_digest_tells_a_changed_byte(at: int) -> None:
+    content = bytearray(sealed(b"object code" * 10))
+    assert unsealed(bytes(content)) == b"object code" * 10
+    assert unsealed(b"without a digest") == b"without a digest"
+    content[at] ^= 1
+    with pytest.raises(ValueError, match="digest"):
+        unsealed(bytes(content))
+
+
+KERNELS = """
+import warnings
+import numpy as np
+from numba import njit
+import recon.compiled
+
+@njit(cache=True)
+def scaled(x):
+    return 2 * x
+
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    assert scaled(3.0) == 6.0 and scaled(3) == 6
+print(sum(scaled.stats.cache_misses.values()), len(told), *(str(each.message) for each in told))
+"""
+
+
+def _run(script: Path, **environment: str) -> str:
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    own = plain | {"PYTHONPATH": str(ROOT), "HOME": "/proc/nohome"} | environment
+    own.pop("XDG_CACHE_HOME", None)
+    words = [sys.executable, "-B", str(script)]
+    done = subprocess.run(words, env=own, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def kernels(tmp_path: Path) -> Path:
+    """A script with a kernel that is compiled for two types."""
+    (tmp_path / "kernels.py").write_text(KERNELS, encoding="utf-8")
+    return tmp_path / "kernels.py"
+
+
+def test_without_a_place_to_write_kernels_are_compiled_in_memory_with_one_warning(kernels: Path) -> None:
+    (kernels.parent / "__pycache__").write_text("a file where the folder would be", encoding="utf-8")
+    said = _run(kernels, NUMBA_CACHE_DIR="/proc/nocache")
+    assert said.startswith("2 1 ")
+    assert "NUMBA_CACHE_DIR" in said
+
+
+@pytest.mark.parametrize("damage", [b"", b"\0" * 4096, None], ids=["empty", "zeros", "a changed byte"])
+def test_a_damaged_kernel_is_compiled_anew_and_mended(kernels: Path, damage: bytes | None) -> None:
+    assert _run(kernels).startswith("2 0")
+    assert _run(kernels).startswith("0 0")
+    for path in (files := sorted((kernels.parent / "__pycache__").glob("*.nb*"))):
+        content = path.read_bytes()
+        path.write_bytes(content[:-60] + bytes([content[-60] ^ 1]) + content[-59:] if damage is None else damage)
+        assert not _run(kernels).startswith("0 "), path.name
+        assert _run(kernels).startswith("0 0")
+    assert len(files) == 3  # an index, and code for each type
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from beamline.core.errors import ConfigError
 from beamline.projections.corrections.counts import Defects
@@ -51,7 +51,7 @@ class Phase:
     name: ClassVar[str] = "phase"
     follows: ClassVar[tuple[str, ...]] = ("tilt",)
     needs_finished: ClassVar[str] = ""
-    blurs: ClassVar[bool] = True  # what looks for fine detail leaves it out
+    blurs: ClassVar[Literal[True]] = True  # what looks for fine detail leaves it out
     material: str | None = option(
         "--phase",
         "none",

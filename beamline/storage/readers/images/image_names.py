@@ -1,13 +1,15 @@
-"""Names of image files: the kind of each frame, and the angle where the name says it."""
+"""Names of image files: the kind of each frame, its number, and the angle where the name says it."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
+from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from drivers.base.frame import FrameKind
@@ -22,6 +24,8 @@ _TAGGED = re.compile(rf"(?<![a-z])(?:angle|theta|ang|deg)[ _=-]?({_NUMBER})|({_N
 _DEGREES_AND_THOUSANDTHS = re.compile(r"_(\d{3})_(\d{3})(?=_\d+$)")
 _LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
 _FARTHEST = 3600.0  # degrees
+COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
+_DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
 
 
 def kind_of(name: str) -> FrameKind:
@@ -121,3 +125,109 @@ def angles_of(names: Sequence[str]) -> NDArray[np.float64] | None:
     if not angles.size or np.ptp(angles) < _LEAST_SPAN or np.abs(angles).max() > _FARTHEST:
         return None
     return np.radians(angles) if 2 * np.unique(angles).size > angles.size else None
+
+
+@dataclass(frozen=True, eq=False)
+class NamedImages:
+    """The images of a scan as their names order them: darks, flats, then the projections by their numbers.
+
+    Attributes:
+        names: of the files.
+        kinds: int32 [file], values of FrameKind.
+        angles: float64 [file] radians, NaN where the name says none.
+        numbers: int64 [file], -1 of references that do not count with the series; None where files are not numbered.
+        of_series: int64 [projection], the numbers of the series; None where they count no images.
+    """
+
+    names: list[str]
+    kinds: NDArray[np.int32]
+    angles: NDArray[np.float64]
+    numbers: NDArray[np.int64] | None
+    of_series: NDArray[np.int64] | None
+
+    @property
+    def references(self) -> int:
+        """How many darks and flats come first."""
+        return int((self.kinds != FrameKind.PROJECTION).sum())
+
+
+def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -> NamedImages:
+    """The images of a scan, in order.
+
+    Args:
+        one_series: all of them are one numbered series, whatever the names say of kinds.
+
+    Raises:
+        DataError: no series can be told to be the projections, or there are several.
+    """
+    images = natural_sorted(images)
+    kinds = dict.fromkeys(images, FrameKind.PROJECTION) if one_series else kinds_of(path, images)
+    series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
+    if not series:
+        raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
+    angles = angles_of(series)
+    plain = series if angles is None else [without_angle(name) for name in series]
+    counted = _numbers(plain)
+    if counted is None or (len({_template(name) for name in plain}) > 1 and not one_series):
+        if len(series) > 1 and (angles is None or len({_template(name) for name in plain}) > 1):
+            raise DataError(_several_series(path, plain))
+        ordered = {name: i for i, name in enumerate(natural_sorted(set(plain)))}
+        counted = np.array([ordered[name] for name in plain], np.int64)
+    taken = np.argsort(counted, kind="stable")
+    series, angles = [series[i] for i in taken], None if angles is None else angles[taken]
+    references = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
+    names = references + series
+    of_angles = np.full(len(names), np.nan)
+    if angles is not None:
+        of_angles[len(references) :] = angles
+    together, of_series = _frame_numbers(names), _frame_numbers([plain[i] for i in taken])
+    if together is None and of_series is not None:
+        together = np.concatenate([np.full(len(references), -1), of_series])
+    return NamedImages(names, np.array([kinds[name] for name in names], np.int32), of_angles, together, of_series)
+
+
+def _template(name: str) -> str:
+    return re.sub(r"\d+", "", name)
+
+
+def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
+    """The number of each image, wherever it stands in the name; None where no number is another in each name.
+
+    Of several that are, the one that counts most closely; others, such as a date, may only go along with it.
+    """
+    numbers = np.zeros(len(names), np.int64)
+    of_template: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        of_template.setdefault(_template(name), []).append(i)
+    for rows in of_template.values():
+        digits = [re.findall(r"\d+", names[i]) for i in rows]
+        columns = [[int(each[-18:]) for each in column] for column in zip(*digits, strict=True)]
+        if not columns:
+            return None
+        varying = [n for n, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
+        counting = [n for n in varying if len(set(columns[n])) == len(rows)]
+        dates = {n for n in varying if min(columns[n]) >= _DATE}
+        if not counting or set(varying) - {*counting} - dates:
+            return None
+        closest = min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))
+        numbers[rows] = columns[closest]
+    return numbers if np.unique(numbers).size == len(names) or len(of_template) > 1 else None
+
+
+def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
+    """The numbers of images that count frames, not dates."""
+    numbers = _numbers(names)
+    return None if numbers is None or np.ptp(numbers) > COUNTED * numbers.size else numbers
+
+
+def _several_series(path: object, names: Sequence[str]) -> str:
+    templates = [_template(name) for name in names]
+    if len(set(templates)) == 1:
+        templates = [re.sub(r"\d+(?=\D*$)", "", name) for name in names]
+    kinds = sorted(set(templates))
+    numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in kinds[:6])
+    return (
+        f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, flat_0001.tif), or "
+        "give the folder of the projections, and the others apart, with --darks and --flats. Where all are one series, "
+        "say which images are which: --frames darks=0:5,flats=5:10."
+    )

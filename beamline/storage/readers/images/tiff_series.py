@@ -19,25 +19,24 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tifffile import TiffFile, natural_sorted
+from tifffile import TiffFile
 
 from beamline.core.errors import DataError
 from beamline.core.files import TEXT, decoded
 from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import angles_of, kinds_of, without_angle
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.ending import ScanEnding
-from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
 LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
@@ -46,32 +45,20 @@ class TiffSeriesSource(ScanSource):
 
     format = "tiff_series"
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, one_series: bool = False) -> None:
+        """Open. `one_series`: all images are one numbered series, whatever the names say of kinds."""
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
         try:
             names = self._names()
-            images = natural_sorted(name for name in names if name.lower().endswith(SUFFIXES))
-            kinds = kinds_of(path, images)
-            series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
-            _check_one_series(path, series)
+            images = in_order(path, [name for name in names if name.lower().endswith(SUFFIXES)], one_series=one_series)
+            self._files, self.image_key, self.angles = images.names, images.kinds, images.angles
+            self.in_order, self.numbers = images.references == 0, images.numbers
+            self.exposures = np.full(len(self._files), np.nan)
+            references, series = self._files[: images.references], self._files[images.references :]
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
-            in_names = angles_of(series)
-            if in_names is not None:  # their angle does not say their order
-                rest = [without_angle(name) for name in series]
-                place = {name: i for i, name in enumerate(natural_sorted(set(rest)))}
-                taken = np.argsort([place[name] for name in rest], kind="stable")
-                series, in_names = [series[i] for i in taken], in_names[taken]
-            order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
-            self._files = order + series
-            self.in_order, self.numbers = not order, _numbers_of_frames(order, series)
-            self.image_key = np.array([kinds[name] for name in self._files], np.int32)
-            self.angles = np.full(len(self._files), np.nan)
-            if in_names is not None:
-                self.angles[len(order) :] = in_names
-            self.exposures = np.full(len(self._files), np.nan)
-            some = order[:: len(order) // _REFERENCES + 1]
+            some = references[:: len(references) // _REFERENCES + 1]
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
@@ -79,15 +66,14 @@ class TiffSeriesSource(ScanSource):
         except BaseException:
             self.close()
             raise
-        numbers = _numbers(series if in_names is None else [without_angle(name) for name in series])
-        if numbers is not None and np.ptp(numbers) >= _MOST_NUMBERS:
-            numbers = None  # dates and serial numbers count no images
-        left_out = [] if numbers is None else sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()})
-        gaps, before = spans(left_out), len(order) - (0 if numbers is None else int(numbers.min()))
-        self._missing = tuple(before + number for number in left_out)
+        self._missing, gaps = _left_out(images)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
-        if in_names is not None and len(self._texts) != 1:
+        if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return offered(self)
 
     @property
     def ending(self) -> ScanEnding:
@@ -133,7 +119,7 @@ class TiffSeriesSource(ScanSource):
         try:
             with self._opened(name, most) as file:
                 return file.read(min(most, self._size(name)))
-        except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
+        except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _size(self, name: str) -> int:
@@ -151,7 +137,7 @@ class TiffSeriesSource(ScanSource):
         try:
             with self._opened(name, LARGEST_IMAGE) as file, TiffFile(file) as tif:
                 yield tif
-        except (*UNREADABLE, RuntimeError) as error:
+        except UNREADABLE as error:
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
@@ -226,43 +212,17 @@ def _entries(path: Path) -> int:
     return n
 
 
-def _prefix(name: str) -> str:
-    return re.sub(r"\d+(?=\.\w+$)", "", name)
-
-
-def _check_one_series(path: Path, names: list[str]) -> None:
-    if not names:
-        raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
-    prefixes = sorted({_prefix(name) for name in names})
-    if len(prefixes) > 1 and (angles_of(names) is None or len({_prefix(without_angle(name)) for name in names}) > 1):
-        numbers = ", ".join(
-            f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6]
-        )
-        raise DataError(
-            f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, "
-            "flat_0001.tif), or give the folder of the projections, and the others apart, with --darks and --flats."
-        )
-
-
-def _numbers_of_frames(references: list[str], series: list[str]) -> NDArray[np.int64] | None:
-    """Numbers of darks and flats, -1 where they do not count with the series, and of the series; None without its."""
-    together, of_series = _numbers(references + series), _numbers(series)
-    if together is not None or of_series is None:
-        return together
-    return np.concatenate([np.full(len(references), -1), of_series])
-
-
-def _numbers(names: list[str]) -> NDArray[np.int64] | None:
-    """The number at the end of each name; None where one has none, or where they are no counts (dates)."""
-    matches = [re.search(r"(\d{1,18})\.\w+$", name) for name in names]
-    numbers = np.array([int(match[1]) for match in matches if match is not None], np.int64)
-    if numbers.size < len(names) or np.ptp(numbers) > COUNTED * numbers.size:
-        return None
-    return numbers
+def _left_out(images: NamedImages) -> tuple[tuple[int, ...], str]:
+    """The places in the scan of numbers that a series leaves out, and these numbers in words."""
+    numbers = images.of_series
+    if numbers is None or np.ptp(numbers) >= _MOST_NUMBERS:  # dates and serial numbers count no images
+        return (), ""
+    left_out, first = sorted({*range(numbers.min(), numbers.max())} - {*numbers.tolist()}), int(numbers.min())
+    return tuple(images.references + number - first for number in left_out), spans(left_out)
 
 
 FORMAT = ScanFormat(
     "a folder or .zip of TIFFs",
     lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
-    lambda path, opening: TiffSeriesSource(path),
+    lambda path, opening: TiffSeriesSource(path, one_series=opening.one_series),
 )

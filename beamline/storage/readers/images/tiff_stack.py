@@ -12,8 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.side_files import offered
+from beamline.storage.readers.tiff import (
+    SUFFIXES,
+    UNREADABLE,
+    Complaints,
+    appended,
+    pages_one_by_one,
+    refuse_packed,
+    refuse_volume,
+)
 from drivers.base.frame import FrameKind
 
 MANY_PAGES = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
@@ -50,6 +59,7 @@ class TiffStackSource(ScanSource):
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
+        refuse_packed(self._tif)
         if len(self._tif.pages) > MANY_PAGES and appended(self._tif):
             first = self._tif.pages.first
             self.shape, self.dtype = (int(first.imagelength), int(first.imagewidth)), np.dtype(first.dtype)
@@ -71,6 +81,10 @@ class TiffStackSource(ScanSource):
         if one_by_one:
             return len(self._tif.pages)
         return 1 if len(series.shape) == 2 else int(series.shape[0])
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return offered(self)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

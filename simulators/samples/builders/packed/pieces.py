@@ -2,17 +2,119 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import Any
+from types import MappingProxyType
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+from pydantic import Field
 
 from simulators.frame.mapping import SceneError, build, choose, located
 from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.builders.packed.change import CHANGES
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
 from simulators.samples.builders.piece import Piece, PieceBuilder
 from simulators.samples.sample import Changing, Sample
+
+_Seconds = Annotated[float, Field(ge=0, le=1e6)]
+_Over = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class ChangeInTime(Protocol):
+    """A change of a sample with time."""
+
+    def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
+        """The pieces at this time since the camera was connected. ValueError: pieces that do not change so."""
+
+
+@dataclass(frozen=True)
+class Settle:
+    """All matter sinks towards the lowest point, and holes shrink as much: a foam that loses gas and liquid.
+
+    Heights above the bottom, and the widths of holes, are multiplied by 1 - share (1 - exp(-t / over_s)). So holes that
+    do not touch never do. The attenuation of the matter stays.
+
+    Attributes:
+        share: of the height that is lost in the end.
+        from_s: s since the camera was connected, when it begins.
+        over_s: s, time constant.
+    """
+
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    from_s: _Seconds = 0.0
+    over_s: _Over = 10.0
+
+    def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
+        past = max(seconds - self.from_s, 0.0)
+        left = 1 + self.share * math.expm1(-past / self.over_s)
+        bottom = min(_bottom(piece) for piece in pieces)
+        return tuple(replace(piece, solid=_sunk(piece, left, bottom)) for piece in pieces)
+
+
+def _bottom(piece: Piece) -> float:
+    solid = piece.solid
+    if isinstance(solid, Ellipsoid):
+        return solid.centre[2] - max(solid.semi_axes)
+    if isinstance(solid, Cylinder):
+        return solid.centre[2] - solid.height / 2
+    if isinstance(solid, Box):
+        return solid.centre[2] - solid.edges[2] / 2
+    raise ValueError(f"a {type(solid).__name__.lower()} does not settle: cylinders, boxes and ellipsoids do")
+
+
+def _sunk(piece: Piece, left: float, bottom: float) -> Ellipsoid | Cylinder | Box:
+    solid = piece.solid
+    assert isinstance(solid, Ellipsoid | Cylinder | Box)  # `_bottom` refuses others
+    x, y, z = solid.centre
+    centre = (x, y, bottom + left * (z - bottom))
+    if isinstance(solid, Ellipsoid):
+        a, b, c = solid.semi_axes
+        return replace(solid, semi_axes=(left * a, left * b, left * c), centre=centre)
+    if isinstance(solid, Cylinder):
+        return replace(solid, height=left * solid.height, centre=centre)
+    return replace(solid, edges=(*solid.edges[:2], left * solid.edges[2]), centre=centre)
+
+
+@dataclass(frozen=True)
+class Charge:
+    """Pieces of one role take other attenuations, each at a time of its own: particles of a battery that charge.
+
+    The attenuation of a piece is multiplied by 1 + (factor - 1) s, and s rises from 0 to 1 as a logistic curve. Its
+    middle is drawn between `from_s` and `from_s + over_s`; its width is `each_s`.
+
+    Attributes:
+        role: of the pieces.
+        factor: by which the attenuation is multiplied in the end.
+        from_s: s since the camera was connected, when the first may charge.
+        over_s: s until the last one does.
+        each_s: s that a piece takes from 27 to 73 %.
+        seed: of the moments.
+    """
+
+    role: str = "particle"
+    factor: Annotated[float, Field(gt=0, le=100)] = 0.5
+    from_s: _Seconds = 0.0
+    over_s: _Over = 10.0
+    each_s: _Over = 1.0
+    seed: int = 0
+
+    def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
+        if self.role not in {piece.role for piece in pieces}:
+            raise ValueError(f"role: {self.role!r} is no part of this phantom")
+        moments = self.from_s + self.over_s * np.random.default_rng(self.seed).uniform(size=len(pieces))
+        done = 0.5 * (1 + np.tanh((seconds - moments) / self.each_s / 2))
+        return tuple(
+            replace(piece, solid=replace(piece.solid, attenuation=piece.solid.attenuation * factor))
+            if piece.role == self.role
+            else piece
+            for piece, factor in zip(pieces, (1 + (self.factor - 1) * done).tolist(), strict=True)
+        )
+
+
+CHANGES: Mapping[str, type[Settle | Charge]] = MappingProxyType({"settle": Settle, "charge": Charge})
 
 
 def phantom(name: str, where: str, mapping: Mapping[str, Any], beam: Beam) -> Sample:

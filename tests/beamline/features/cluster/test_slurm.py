@@ -12,10 +12,9 @@ import pytest
 
 import recon
 from beamline.core.errors import ConfigError
-from beamline.features.cluster import slurm
-from beamline.features.cluster.cluster import connected
-from beamline.features.cluster.slurm import SlurmJobs, is_slurm, require_accepted, slurm_jobs
-from beamline.reconstruct import finished_views
+from beamline.features.cluster import cluster as slurm
+from beamline.features.cluster.cluster import SlurmJobs, connected, is_slurm, require_accepted, slurm_jobs
+from beamline.reconstruct import pipeline
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, RunControl
@@ -99,7 +98,7 @@ def test_slurm_is_asked_before_the_scan_is_read(fake: Path, monkeypatch: pytest.
     pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
     (fake / "sbatch").write_text("#!/bin/sh\ncat > asked.sh\necho 'invalid partition specified: day' >&2\nexit 1\n")
     write_exchange(Path("scan.h5"), TwoCylinders(angles=np.radians(np.arange(0, 180, 20.0)), shape=(4, 16), axis_col=8))
-    monkeypatch.setattr(finished_views, "prepare_within", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(pipeline, "prepare_within", lambda *_: pytest.fail("too late"))
     result = beamline("recon", "scan.h5", "-m", "sirt", "--cluster", "slurm", "-o", "out.h5")
     assert result.exit_code == 2 and "Slurm refuses the jobs (invalid partition specified: day)" in result.stderr
     assert "--cpus-per-task=8" in Path("asked.sh").read_text()

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.config import load as config
-from beamline.features.doctor import disk
+from beamline.features.doctor import examine as disk
 
 FOLDER = config.config_folder()
 INSTRUMENT, DEMO = str(FOLDER / "instrument.yaml"), str(FOLDER / "demo.yaml")

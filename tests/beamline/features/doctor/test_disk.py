@@ -16,10 +16,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.doctor import disk
+from beamline.features.doctor import examine as disk
 from beamline.features.doctor.check import Grade
-from beamline.features.doctor.disk import ScanNeeds
-from beamline.features.doctor.examine import memory
+from beamline.features.doctor.examine import ScanNeeds, memory
 from drivers.base.clock import SystemClock
 from simulators.devices.clock import VirtualClock
 

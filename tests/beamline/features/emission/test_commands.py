@@ -194,7 +194,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     groups = np.arange(24).reshape(12, 2)
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
-    data = TrialData(prepared.projections.data, prepared.geometry, None, None, None, prepared.emission)
+    data = TrialData(prepared, None)
     settings: dict[str, int] = {"iterations": 2, "subsets": 3}
     row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups))
     run(row, data, 0, print, keep=tmp_path / "volume.npy")

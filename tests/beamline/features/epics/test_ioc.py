@@ -9,14 +9,13 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.epics.ioc import ProcessVariables, RunServer
+from beamline.features.epics.ioc import SHOWN, RunServer
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 thread = pytest.importorskip("p4p.client.thread")
@@ -115,7 +114,7 @@ def test_a_client_sees_the_time_and_the_alarm_of_each_value(tmp_path: Path) -> N
 def test_every_process_variable_has_a_time_before_there_is_a_run(tmp_path: Path) -> None:
     begin = time.time()
     with _served(tmp_path, control=True) as (_, client):
-        named = [each.metadata["name"] for each in fields(ProcessVariables)]
+        named = [each.metadata["name"] for each in SHOWN]
         for name in [*named, "Heartbeat", "PauseScan", "ResumeScan", "StopScan", "AbortScan"]:
             assert begin <= client.get(f"T:{name}").timestamp <= time.time()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 
@@ -100,11 +99,4 @@ def test_what_has_no_surface_is_refused_and_nothing_is_left(
 ) -> None:
     result = beamline("surface", "ball.npz", "-o", "x.stl", *options)
     assert result.exit_code == code and said in result.output + str(result.exception)
-    assert left(ball) == {"ball.npz"}
-
-
-def test_without_scikit_image_one_line_says_what_to_install(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    result = beamline("surface", "ball.npz", "-o", "x.stl")
-    assert result.exit_code == 2 and 'pip install "splatline[surface]"' in result.output
     assert left(ball) == {"ball.npz"}

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.features.tango.device import ServerPlace, device_class, push_changes
-from beamline.features.tango.followed_run import FollowedRun
-from beamline.features.tango.values import ScanAttributes
+from beamline.features.tango.served_run import SHOWN, ServedRun
 from beamline.scan.control import Verb
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume
@@ -32,7 +30,7 @@ WITHIN = 60.0  # s
 
 def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tango", None)
-    with pytest.raises(ConfigError, match=r"splatline\[tango\]"), closing(FollowedRun(tmp_path, print)) as run:
+    with pytest.raises(ConfigError, match=r"splatline\[tango\]"), closing(ServedRun(tmp_path, print)) as run:
         device_class(run, control=False)
 
 
@@ -61,13 +59,13 @@ def _signals_as_before() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FollowedRun, Path, Any]]:
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[ServedRun, Path, Any]]:
     """The one device of this process, which Tango allows no second server; its folder of runs is empty at first."""
     from tango.test_context import DeviceTestContext
 
     runs = tmp_path_factory.mktemp("runs")
     with (
-        closing(FollowedRun(runs, lambda line: None)) as run,
+        closing(ServedRun(runs, lambda line: None)) as run,
         _signals_as_before(),
         DeviceTestContext(device_class(run, control=True), process=False, debug=0) as device,
     ):
@@ -87,7 +85,7 @@ def _write_run(runs: Path) -> TwoCylinders:
     return scan
 
 
-def test_a_run_as_a_client_sees_it(served: tuple[FollowedRun, Path, Any]) -> None:
+def test_a_run_as_a_client_sees_it(served: tuple[ServedRun, Path, Any]) -> None:
     run, runs, device = served
     run.look()
     assert (device.state(), device.ScanStatus, device.SampleName) == (tango.DevState.ON, "idle", "")
@@ -127,7 +125,7 @@ def test_only_what_was_set_again_is_pushed(tmp_path: Path) -> None:
         def push_change_event(self, name: str, value: Any, at: float, quality: Any) -> None:
             pushed[name] = value, quality
 
-    with closing(FollowedRun(tmp_path, print, lambda: 100.0)) as run:
+    with closing(ServedRun(tmp_path, print, lambda: 100.0)) as run:
         before = run.look()
         push_changes(Recorder(), before, run.look())
         assert pushed == {}
@@ -140,11 +138,11 @@ def test_only_what_was_set_again_is_pushed(tmp_path: Path) -> None:
 
 
 def test_verbs_are_commands_only_with_control(tmp_path: Path) -> None:
-    with closing(FollowedRun(tmp_path, print)) as run:
+    with closing(ServedRun(tmp_path, print)) as run:
         watching, controlling = (vars(device_class(run, control)) for control in (False, True))
     verbs = {verb.value.capitalize() for verb in Verb}
     assert not verbs & set(watching) and verbs <= set(controlling)
-    assert {each.metadata["name"] for each in fields(ScanAttributes)} <= set(watching)
+    assert {each.metadata["name"] for each in SHOWN} <= set(watching)
 
 
 _EVENTS = """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,17 +13,22 @@ import pytest
 
 from beamline.features.trials import worker
 from beamline.features.trials.data import TrialData, by_parts
-from beamline.features.trials.plans import plan_in_time, plan_of_energies, work
+from beamline.features.trials.plans import plan_in_time, plan_of_energies
 from beamline.features.trials.trial import Trial
-from beamline.features.trials.worker import main, run, shown
+from beamline.features.trials.worker import run, shown
+from beamline.projections.held_out import with_views_held_out
+from beamline.projections.prepared import PreparedProjections
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.base.method import Energies
 from recon.base.volume import Grid, Volume
 from recon.features.joint.energy_fit import EnergyViews
 from recon.features.joint.series import TimedViews, fit_series
 from recon.features.joint.spectral import fit_materials
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import project
+from tests.beamline.features.trials.test_worker import done
+from tests.beamline.prepared_views import prepared_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 VIEWS, HELD_OUT, SIDE, ROWS = 40, 5, 20, 2
@@ -44,46 +50,43 @@ def discs() -> F32:
     return np.repeat(np.stack(both)[:, None], ROWS, 1).astype(np.float32)
 
 
-def data_of(weights: tuple[np.ndarray, ...], of_view: np.ndarray, **given: object) -> TrialData:  # type: ignore[type-arg]
+def data_of(weights: tuple[np.ndarray, ...], of_view: np.ndarray, **given: Callable[..., object]) -> TrialData:  # type: ignore[type-arg]
     """Views of sums of two discs with the weights of each view; the last five are held out."""
     angles = np.mod(np.arange(VIEWS + HELD_OUT) * 2.4, np.pi)
     geometry = Geometry.parallel(angles, (ROWS, SIDE))
     grid = Grid.matching(geometry)
     lines = [project(Volume(disc, grid), geometry) for disc in discs()]
     seen = sum(line * weight[:, None, None] for line, weight in zip(lines, weights, strict=True)).astype(np.float32)
-    used, unseen = np.arange(VIEWS), np.arange(VIEWS, VIEWS + HELD_OUT)
-    held = seen[unseen], geometry.select(unseen)
-    return TrialData(seen[used], geometry.select(used), held, None, of_view=of_view, **given)  # type: ignore[arg-type]
+    prepared = prepared_views(seen, geometry, **{name: of(of_view) for name, of in given.items()})
+    unseen = np.arange(VIEWS, VIEWS + HELD_OUT)
+    return TrialData(with_views_held_out(prepared, unseen), None, of_view[unseen].astype(np.float64))
 
 
 @pytest.fixture
 def in_time() -> TrialData:
     """The first disc fades while the second grows; views held out are of moments between the others."""
     times = np.concatenate((np.linspace(0, 10, VIEWS), np.linspace(1, 9, HELD_OUT)))
-    return data_of((1 - times / 10, times / 10), times)
+    return data_of((1 - times / 10, times / 10), times, times=lambda of_view: of_view)
 
 
 @pytest.fixture
 def of_energies() -> TrialData:
     energy = np.arange(VIEWS + HELD_OUT) % 2
     shares = SECTIONS[energy]
-    return data_of((shares[:, 0], shares[:, 1]), energy.astype(np.float64), sections=SECTIONS)
+    return data_of((shares[:, 0], shares[:, 1]), energy, energies=lambda of_view: Energies(of_view, SECTIONS))
 
 
-def plain_fbp(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
-    return fbp(projections, geometry)
+def plain_fbp(prepared: PreparedProjections) -> F32:
+    return fbp(prepared.projections.data, prepared.geometry)
 
 
 def test_parts_in_time_are_linear_between_their_middles(in_time: TrialData) -> None:
     order = np.random.default_rng(0).permutation(VIEWS)
-    mixed = replace(
-        in_time, projections=in_time.projections[order], geometry=in_time.geometry.select(order),
-        of_view=np.concatenate((in_time.shown[:VIEWS][order], in_time.shown[VIEWS:])),
-    )  # fmt: skip
+    mixed = replace(in_time, prepared=in_time.prepared.of_views(order))
     volume_at = by_parts(2, mixed, plain_fbp)
-    halves = [np.sort(np.argsort(mixed.shown[:VIEWS])[half]) for half in (slice(0, 20), slice(20, 40))]
-    first, last = (fbp(mixed.projections[half], mixed.geometry.select(half)) for half in halves)
-    early, late = (mixed.shown[:VIEWS][half].mean() for half in halves)
+    halves = [np.sort(np.argsort(mixed.shown)[half]) for half in (slice(0, 20), slice(20, 40))]
+    first, last = (plain_fbp(mixed.prepared.of_views(half)) for half in halves)
+    early, late = (mixed.shown[half].mean() for half in halves)
     for time, expected in ((0.0, first), (early, first), ((early + late) / 2, (first + last) / 2), (10.0, last)):
         np.testing.assert_allclose(volume_at(float(time)), expected, atol=1e-6)
 
@@ -91,8 +94,8 @@ def test_parts_in_time_are_linear_between_their_middles(in_time: TrialData) -> N
 def test_parts_of_energies_are_one_an_energy(of_energies: TrialData) -> None:
     volume_at = by_parts(2, of_energies, plain_fbp)
     for energy in (0, 1):
-        own = np.flatnonzero(of_energies.shown[:VIEWS] == energy)
-        expected = fbp(of_energies.projections[own], of_energies.geometry.select(own))
+        own = np.flatnonzero(of_energies.shown == energy)
+        expected = plain_fbp(of_energies.prepared.of_views(own))
         np.testing.assert_array_equal(volume_at(float(energy)), expected)
 
 
@@ -104,43 +107,45 @@ def kept(trial: Trial, data: TrialData, folder: Path) -> F32:
 
 
 def test_one_fit_in_time_is_that_of_recon(in_time: TrialData, tmp_path: Path) -> None:
-    times = in_time.shown[:VIEWS]
-    views = TimedViews(in_time.projections, in_time.geometry, times)
+    times = in_time.shown
+    views = TimedViews(in_time.prepared.projections.data, in_time.geometry, times)
     expected = fit_series(views, 2, motion=False, tv_weight=0.01, sweeps=15)
     np.testing.assert_array_equal(kept(SERIES, in_time, tmp_path), expected.at(float(np.sort(times)[VIEWS // 2])))
 
 
 def test_one_fit_of_energies_is_that_of_recon(of_energies: TrialData, tmp_path: Path) -> None:
-    energy = of_energies.shown[:VIEWS].astype(np.intp)
-    made = fit_materials(EnergyViews(of_energies.projections, of_energies.geometry, energy, SECTIONS))
+    energy = of_energies.shown.astype(np.intp)
+    made = fit_materials(EnergyViews(of_energies.prepared.projections.data, of_energies.geometry, energy, SECTIONS))
     at = kept(MATERIALS, of_energies, tmp_path)
     np.testing.assert_allclose(at, SECTIONS[1, 0] * made.densities[0] + SECTIONS[1, 1] * made.densities[1], rtol=1e-5)
 
 
 def test_rays_that_were_not_measured_do_not_count(in_time: TrialData) -> None:
-    weights = np.ones((VIEWS + HELD_OUT, ROWS, SIDE), np.float32)
-    weights[:, :, :3] = 0
+    measured = np.ones((ROWS, SIDE), np.bool_)
+    measured[:, :3] = False
+    assert in_time.prepared.held_out is not None
+    unseen, geometry = in_time.prepared.held_out
     figures = []
     for filled in (0.0, 9.0):
-        used = in_time.projections.copy()
-        used[:, :, :3] = filled
-        assert in_time.held_out is not None
-        held = np.where(weights[VIEWS:] > 0, in_time.held_out[0], np.float32(filled))
-        given = replace(in_time, projections=used, weights=weights, held_out=(held, in_time.held_out[1]))
-        figures.append(run(SERIES, given, 0, print)["squared_residuals"])
+        views = in_time.prepared.projections
+        used, held = (np.where(measured, lines, np.float32(filled)) for lines in (views.data, unseen))
+        given = replace(
+            in_time.prepared, projections=replace(views, data=used), measured=measured, held_out=(held, geometry)
+        )
+        figures.append(run(SERIES, replace(in_time, prepared=given), 0, print)["squared_residuals"])
     np.testing.assert_array_equal(*figures)
 
 
 def test_each_view_held_out_is_compared_with_the_volume_of_its_time(in_time: TrialData) -> None:
     """The truth leaves nothing of them; the volume of one moment does."""
-    assert in_time.held_out is not None
-    unseen, geometry = in_time.held_out
+    assert in_time.prepared.held_out is not None and in_time.shown_held_out is not None
+    unseen, geometry = in_time.prepared.held_out
     grid = Grid.matching(geometry)
 
     def truth(time: float) -> F32:
         return np.tensordot(np.array([1 - time / 10, time / 10], np.float32), discs(), 1)
 
-    views = partial(shown, of_view=in_time.shown[VIEWS:], geometry=geometry, grid=grid)
+    views = partial(shown, of_view=in_time.shown_held_out, geometry=geometry, grid=grid)
     np.testing.assert_allclose(views(truth), unseen, atol=1e-4)
     assert np.abs(views(lambda time: truth(5.0)) - unseen).max() > 1
 
@@ -163,14 +168,7 @@ def test_a_share_of_states_is_explained_from_few_views(of_energies: TrialData) -
 def test_times_and_energies_come_through_the_file(
     of_energies: TrialData, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    of_energies.save(tmp_path / "data")
-    back = TrialData.load(tmp_path / "data")
-    assert back.sections is not None
-    np.testing.assert_array_equal(back.sections, SECTIONS)
-    np.testing.assert_array_equal(back.shown, of_energies.shown)
-    job = {"data": str(tmp_path / "data"), "trial": MATERIALS.as_job(), "seed": 0}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    assert main(tmp_path / "job.json") == 0
+    assert done(of_energies, tmp_path, MATERIALS) == 0
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["squared_residuals"] == pytest.approx(run(MATERIALS, of_energies, 0, print)["squared_residuals"])
 
@@ -178,10 +176,8 @@ def test_times_and_energies_come_through_the_file(
 def test_too_few_views_are_a_failed_trial(
     in_time: TrialData, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    in_time.save(tmp_path / "data")
     trial = replace(SERIES, settings={"volumes": 9, "moves": False})
-    (tmp_path / "job.json").write_text(json.dumps({"data": str(tmp_path / "data"), "trial": trial.as_job(), "seed": 0}))
-    assert main(tmp_path / "job.json") == 1
+    assert done(in_time, tmp_path, trial) == 1
     assert "9 volumes of 40 views" in json.loads(capsys.readouterr().out.splitlines()[-1])["message"]
 
 
@@ -192,7 +188,6 @@ def test_a_plan_in_time_ignores_it_then_parts_it_then_fits_all() -> None:
     assert [t.title for t in trials[-3:]] == [
         f"series, 4 volumes, motion {how}" for how in ("none", "learnt", "chosen")
     ]
-    assert work(trials[-3]) < work(trials[-2]) < work(trials[-1])
     assert max(t.parts for t in plan_in_time(("fbp",), 30, 1000, 4)) == 4  # a part has six views or more
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import pickle
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +18,7 @@ from beamline.features.trials.plans import plan
 from beamline.features.trials.trial import Trial
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
@@ -54,25 +55,24 @@ def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    echo = "import sys; print(open(sys.argv[1]).read().replace(chr(10), ' '), file=open(sys.argv[2], 'w'))"
-    out = tmp_path / "seen.json"
-    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", echo, str(job), str(out)])
+    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", ""])
     compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
-    job = json.loads(out.read_text())
+    job = pickle.loads((tmp_path / "job.pickle").read_bytes())  # noqa: S301 - written by this test
     words = ("start", "fit.loss", "fit.kernel")
-    kinds = [(trial["method"], *(trial["settings"].get(name, "") for name in words)) for trial in job["compile"]]
+    kinds = [(trial.method, *(trial.settings.get(name, "") for name in words)) for trial in job.compiled]
     assert sorted(kinds) == [
         ("fbp", "", "", ""), ("r2", "", "", ""), ("r2", "", "", "gaussian"), ("r2", "", "l2", ""),
         ("r2", "", "poisson", ""), ("r2", "tv", "", ""), ("sirt", "", "", ""),
     ]  # fmt: skip
-    assert job["data"] == str(tmp_path / "data")  # whose geometry decides which kernels are used
+    assert job.data == tmp_path / "data"  # whose geometry decides which kernels are used
 
 
 @pytest.mark.slow
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
     views = Geometry.parallel(SCAN.angles, SCAN.shape)
-    data = TrialData(SCAN.line_integrals().astype(np.float32), views, None, SCAN.truth(Grid.matching(views)))
+    prepared = prepared_views(SCAN.line_integrals().astype(np.float32), views)
+    data = TrialData(prepared, SCAN.truth(Grid.matching(views)))
     data.save(tmp_path / "data")
     ballast = np.ones(90_000_000)  # 720 MB
     outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.features.trials import runner
-from beamline.features.trials.data import TrialData
+from beamline.features.trials.data import TrialData, averaged
 from beamline.features.trials.launch import DATA
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import measured
@@ -43,8 +43,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
         truth = SCAN.truth(grid)
         figures, _ = measured(lambda key: truth + np.float32(ERROR) if found else truth, data, grid, keep)
         assert trial.choice is not None
-        lines, geometry, _ = data.chosen(trial.choice)
-        found.append((trial, replace(data, projections=lines, geometry=geometry)))
+        found.append((trial, replace(data, prepared=averaged(data.prepared, trial.choice))))
         reached = "" if trial.seconds_asked is None else "7 iterations"
         return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0, reached=reached)
 
@@ -125,8 +124,8 @@ def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any
     whole, *rows = (data for _, data in seen)
     mean = rows[3]  # after three of single views: two views side by side
     assert mean.geometry.n_views == 180
-    light = np.exp(-whole.projections.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
-    np.testing.assert_allclose(mean.projections, -np.log(light), atol=1e-5)
+    light = np.exp(-whole.prepared.projections.data.astype(np.float64)).reshape(180, 2, 2, 40).mean(axis=1)
+    np.testing.assert_allclose(mean.prepared.projections.data, -np.log(light), atol=1e-5)
     np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("study_started", "done", len(rows))

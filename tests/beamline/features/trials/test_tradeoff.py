@@ -38,10 +38,11 @@ def test_views_in_time_keep_their_times(tmp_path: Path) -> None:
     """The file states no times: views follow each other evenly, which a warning says."""
     path, said = write_exchange(tmp_path / "scan.h5", SCAN), list[str]()
     data, table = planned(asked(path, SCAN.axis_col), SeveralVolumes(volumes=2), said.append)
-    assert data.held_out is not None and data.truth is None
-    angles = np.concatenate((data.geometry.angles, data.held_out[1].angles))
-    np.testing.assert_allclose(np.degrees(angles) / 6, data.shown)  # a view each 6 degrees and second
-    assert data.geometry.n_views == 27 and data.held_out[1].n_views == 3
+    assert data.prepared.held_out is not None and data.truth is None and data.shown_held_out is not None
+    angles = np.concatenate((data.geometry.angles, data.prepared.held_out[1].angles))
+    shown = np.concatenate((data.shown, data.shown_held_out))
+    np.testing.assert_allclose(np.degrees(angles) / 6, shown)  # a view each 6 degrees and second
+    assert data.geometry.n_views == 27 and shown.size == 30
     assert any("states no time" in warning for warning in said)
     assert "over 29 s" in table.scan["views used"]
     assert [outcome.trial.group for outcome in table.outcomes] == ["method", "parts", "parts", *["one fit"] * 3]
@@ -55,16 +56,17 @@ def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path
     pytest.importorskip("xraylib")
     several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "charged"))
     data, table = planned(asked(scans[0], 31.5), several, lambda said: None)
-    assert data.held_out is not None and data.sections is not None
-    assert data.geometry.n_views == 84 and data.held_out[1].n_views == 12
-    assert np.bincount(data.shown.astype(int)).tolist() == [24] * 4
+    prepared, unseen = data.prepared, data.shown_held_out
+    assert prepared.held_out is not None and prepared.energies is not None and unseen is not None
+    assert data.geometry.n_views == 84 and prepared.held_out[1].n_views == 12
+    assert np.bincount(np.concatenate((data.shown, unseen)).astype(int)).tolist() == [24] * 4
     oxide = known("NMC811")
-    assert oxide is not None and data.sections.shape == (len(ENERGIES), 2)
+    assert oxide is not None and prepared.energies.cross_sections.shape == (len(ENERGIES), 2)
     assert table.scan["materials"] == "fresh, charged"
-    brightest = [max(float(image.max()) for image in data.projections[data.shown[:84] == e]) for e in range(4)]
+    brightest = [max(float(image.max()) for image in prepared.projections.data[data.shown == e]) for e in range(4)]
     assert np.argmin(brightest) == 0  # below the edge
     assert [outcome.trial.method for outcome in table.outcomes] == ["fbp", "materials", "materials"]
-    assert isinstance(data.held_out[1], Geometry)
+    assert isinstance(prepared.held_out[1], Geometry)
 
 
 def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.trials.plans import Timed, plan, plan_in_equal_time, trials_left, work
+from beamline.features.trials.plans import Timed, plan, plan_in_equal_time, quick_first, trials_left
 from beamline.features.trials.trial import QUALITIES, Outcome, Trial
 from recon.base.method import BoundedMethod
 from recon.methods import by_name, names_of_one_volume
@@ -60,14 +60,14 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
             assert getattr(method, length) > 1e5 and f"{seconds:g} s" in trial.label and length not in trial.label
         assert not isinstance(method, BoundedMethod) or method.seconds == seconds
     started = [Timed(trials[0], 2.0 + seconds, seconds)] * done
-    assert (trials_left(started, [trials[0]] * 3) is None) == (not done)
-    assert not done or trials_left(started, [trials[0]] * 3) == pytest.approx(3 * (2.0 + seconds))
+    left = trials_left(started, [trials[0]] * 3, lambda trial: None)
+    assert (left is None) == (not done)
+    assert left is None or left == pytest.approx(3 * (2.0 + seconds))
 
 
 def test_full_tries_more_than_quick() -> None:
     quick, full = (plan(METHODS, 90, 50_000, depth) for depth in ("quick", "full"))
     assert len(quick) < 0.7 * len(full)
-    assert sum(map(work, quick)) < 0.5 * sum(map(work, full))
     assert len({t.label for t in full}) == len(full)
 
 
@@ -97,15 +97,21 @@ def test_labels_say_what_is_not_the_default() -> None:
 def test_the_time_left_is_a_start_each_and_the_work(speed: float, n: int, start: float) -> None:
     base = Trial("method", "r2", 60, settings={"steps": 100, "gaussians": 1000})
     left = [replace(base, settings={**base.settings, "steps": 100 * k}) for k in range(1, n + 1)]
-    expected = n * start + speed * sum(map(work, left))
-    one = Timed(base, start + speed * work(base), speed * work(base))
-    assert trials_left([one], left) == pytest.approx(expected)
-    assert trials_left([one], []) == 0
-    assert trials_left([], left) is None
+
+    def steps(trial: Trial) -> float | None:
+        return float(trial.settings["steps"] or 0) if "steps" in trial.settings else None
+
+    one = Timed(base, start + speed * 100, speed * 100)
+    assert trials_left([one], left, steps) == pytest.approx(n * start + speed * 100 * n * (n + 1) / 2)
+    assert trials_left([one], [], steps) == 0
+    assert trials_left([], left, steps) is None
+    assert quick_first(left[::-1], steps)[0] == left[-1]  # baselines keep their order
+    varied = [replace(each, group="steps") for each in left]
+    assert quick_first([*varied[::-1], base], steps) == (base, *varied)
     # Of a method never tried nothing better is known than the mean of what was.
     done = [Timed(base, 7.0, 4.0), Timed(base, 11.0, 8.0)]
     other = Trial("method", "fbp", 60)
-    assert trials_left(done, [other]) == pytest.approx(3 + 6)
+    assert trials_left(done, [other], steps) == pytest.approx(3 + 6)
     assert trials_left(done, [other], lambda trial: 1.0 if trial is other else 4.0) == pytest.approx(3 + 6 / 4)
 
 

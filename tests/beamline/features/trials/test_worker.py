@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,17 @@ import recon.warm_up
 from beamline.core.errors import DataError
 from beamline.features.trials import worker as module
 from beamline.features.trials.data import TrialData, write_array
+from beamline.features.trials.launch import TrialJob
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import main, on_grid, run
+from beamline.projections.held_out import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.methods import by_name, names_of_one_volume, taking
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import data_residual
+from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -36,57 +40,59 @@ def data() -> TrialData:
     views = Geometry.parallel(SCAN.angles, SCAN.shape, pixel_pitch=0.5, axis_col=SCAN.axis_col)
     integrals = SCAN.line_integrals().astype(np.float32)
     held = np.arange(3, 30, 9)
-    used = np.setdiff1d(np.arange(30), held)
     half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
-    return TrialData(
-        integrals[used], views.select(used), (integrals[held], views.select(held)), half.truth(Grid.matching(views))
-    )
+    prepared = with_views_held_out(prepared_views(integrals, views), held)
+    return TrialData(prepared, half.truth(Grid.matching(views)))
 
 
 def _silent(line: object) -> None:
     pass
 
 
+def done(data: TrialData, folder: Path, trial: Trial | None = None, **more: Any) -> int:
+    """The exit code of a process that runs the trial."""
+    folder.mkdir(exist_ok=True)
+    data.save(folder / "data")
+    (folder / "job").write_bytes(pickle.dumps(TrialJob(folder / "data", trial, **more)))
+    return main(folder / "job")
+
+
 @pytest.mark.parametrize(("method", "binning"), [("fbp", 1), ("fista-tv", 1), ("sirt", 2)])
 def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str, binning: int) -> None:
     """Whatever stands for them in the views that are used, and in those held out."""
-    assert data.held_out is not None
-    weights = np.ones((30, 4, 40), np.float32)
-    weights[:, :, :5] = 0
+    assert data.prepared.held_out is not None
+    measured = np.ones((4, 40), np.bool_)
+    measured[:, :5] = False
     figures = []
     for filled in (0.0, 3.0):
-        used, held = data.projections.copy(), data.held_out[0].copy()
-        used[:, :, :5] = held[:, :, :5] = filled
-        given = replace(data, projections=used, held_out=(held, data.held_out[1]), weights=weights)
+        used, (held, unseen) = data.prepared.projections.data.copy(), data.prepared.held_out
+        used[:, :, :5] = filled
+        views = replace(data.prepared.projections, data=used)
+        held = np.where(measured, held, np.float32(filled))
+        given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
         trial = Trial("method", method, data.geometry.n_views, binning, halves=True)
-        found = run(trial, given, 0, _silent)
+        found = run(trial, replace(data, prepared=given), 0, _silent)
         figures.append([*found["metrics"].values(), *found["squared_residuals"]])
     np.testing.assert_array_equal(*figures)
-    blind = run(trial, replace(given, weights=None), 0, _silent)
+    blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0, _silent)
     assert blind["metrics"]["residual_held_out"] > 1.2 * found["metrics"]["residual_held_out"]
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
     found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0, _silent)
-    expected = fbp(data.projections, data.geometry, filter="hann")
-    assert data.truth is not None and data.held_out is not None
+    expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
+    assert data.truth is not None and data.prepared.held_out is not None
     assert found["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
     volume = Volume(expected, Grid.matching(data.geometry))
-    assert found["metrics"]["residual_held_out"] == pytest.approx(data_residual(volume, *data.held_out))
+    assert found["metrics"]["residual_held_out"] == pytest.approx(data_residual(volume, *data.prepared.held_out))
     assert 2 * 0.5 <= found["metrics"]["resolution"] < 12  # between two voxels and the inner cylinder's size
     assert found["peak_bytes"] is None or found["peak_bytes"] > 1e7
     assert found["seconds"] > 0 and found["gaussians"] is None
 
 
 def test_a_volume_that_is_kept_is_the_one_measured(data: TrialData, tmp_path: Path, capsys: Any) -> None:
-    data.save(tmp_path / "data")
-    job = {
-        "data": str(tmp_path / "data"), "trial": Trial("method", "fbp", 27).as_job(), "seed": 0,
-        "keep": str(tmp_path / "volume.npy"),
-    }  # fmt: skip
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    assert main(tmp_path / "job.json") == 0
-    expected = fbp(data.projections, data.geometry, filter="hann")
+    assert done(data, tmp_path, Trial("method", "fbp", 27), keep=tmp_path / "volume.npy") == 0
+    expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), expected)
     assert data.truth is not None
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -94,16 +100,9 @@ def test_a_volume_that_is_kept_is_the_one_measured(data: TrialData, tmp_path: Pa
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_a_disk_that_is_full_is_no_trial_that_failed(
-    data: TrialData, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data.save(tmp_path / "views")
-    job = {
-        "data": str(tmp_path / "views"), "trial": Trial("method", "fbp", 27).as_job(), "seed": 0,
-        "keep": "/dev/full",
-    }  # fmt: skip
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    assert main(tmp_path / "job.json") == DataError.exit_code
+def test_a_disk_that_is_full_is_no_trial_that_failed(data: TrialData, tmp_path: Path, capsys: Any) -> None:
+    trial = Trial("method", "fbp", 27)
+    assert done(data, tmp_path, trial, keep=Path("/dev/full")) == DataError.exit_code
     assert "/dev/full could not be written (No space left" in capsys.readouterr().out
     with pytest.raises(DataError, match="/dev/full"):  # a last block, which np.save loses
         write_array(Path("/dev/full"), np.zeros(10, np.float32))
@@ -135,8 +134,9 @@ def test_a_fit_with_each_setting(data: TrialData, change: dict[str, Any]) -> Non
 def test_a_fit_is_judged_by_views_that_it_does_not_see(data: TrialData) -> None:
     """Its record ends with the residual of the views held out, and spoiling them changes nothing but that."""
     trial = Trial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
-    assert data.held_out is not None
-    spoilt = replace(data, held_out=(2 * data.held_out[0], data.held_out[1]))
+    assert data.prepared.held_out is not None
+    unseen, geometry = data.prepared.held_out
+    spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
     kept, other = (run(trial, d, 0, _silent) for d in (data, spoilt))
     assert kept["metrics"]["psnr"] == other["metrics"]["psnr"]
     assert kept["curve"][-1][1] > other["curve"][-1][1] + 5
@@ -160,7 +160,8 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     """On a clock that goes on by a tenth of a second whenever it is asked."""
     ticks = itertools.count()
     trial = Trial("method", method, 27, seconds_asked=8.0)
-    found = run(trial, replace(data, held_out=None), 0, _silent, lambda: 0.1 * next(ticks))
+    alone = replace(data, prepared=replace(data.prepared, held_out=None))
+    found = run(trial, alone, 0, _silent, lambda: 0.1 * next(ticks))
     own_length = by_name(method).traits.own_length
     assert (0 if own_length else 0.6 * 8) < found["seconds"] < 1.1 * 8
     number, word = found["reached"].split(", ")[0].split()
@@ -184,7 +185,7 @@ def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
 def _cone(data: TrialData, **leaning: float) -> TrialData:
     """The same pixels as if they were a cone's."""
     around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, axis_col=SCAN.axis_col, **leaning)
-    return replace(data, geometry=around, held_out=None)
+    return replace(data, prepared=replace(data.prepared, geometry=around, held_out=None))
 
 
 @pytest.mark.parametrize("leaning", [{}, {"tilt": 0.1}])
@@ -193,17 +194,14 @@ def test_a_job_may_be_to_compile(
     leaning: dict[str, float],
 ) -> None:  # fmt: skip
     """It compiles for the geometry of the data and says nothing, also of methods that do not take such views."""
-    _cone(data, **leaning).save(tmp_path / "data")
     trials = [
         Trial("method", "cgls", 60, settings={"iterations": 10}),
         Trial("method", "r2", 60, settings={"steps": 500, "gaussians": 1000}),
     ]
-    job = {"data": str(tmp_path / "data"), "compile": [trial.as_job() for trial in trials]}
-    (tmp_path / "job.json").write_text(json.dumps(job))
     fitted: list[Geometry] = []
     plain = recon.warm_up.reconstruct
     monkeypatch.setattr(recon.warm_up, "reconstruct", lambda *said, **k: fitted.append(said[1]) or plain(*said, **k))
-    assert main(tmp_path / "job.json") == 0
+    assert done(_cone(data, **leaning), tmp_path, compiled=trials) == 0
     assert capsys.readouterr().out == ""
     assert len(fitted) == 3  # the fit may end with patches, whose kernels are compiled, too
     assert all(views.is_cone and views.is_straight != bool(leaning) for views in fitted)
@@ -219,11 +217,12 @@ def test_trials_of_a_cone(data: TrialData) -> None:
 def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views half a turn apart are not the same ones of a cone: neither may one half of them be half the circle."""
     cone = _cone(data)
-    around = replace(cone, geometry=cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False)))
+    turn = cone.geometry.at(np.linspace(0, 2 * np.pi, 27, endpoint=False))
+    around = replace(cone, prepared=replace(cone.prepared, geometry=turn))
     seen: list[NDArray[np.float64]] = []
     plain = module.reconstruct
     monkeypatch.setattr(module, "warm_up", lambda *_: None)
-    monkeypatch.setattr(module, "reconstruct", lambda *said: seen.append(said[2].angles) or plain(*said))
+    monkeypatch.setattr(module, "reconstruct", lambda *said: seen.append(said[1].geometry.angles) or plain(*said))
     run(Trial("method", "fbp", 8, halves=True), around, 0, _silent)
     for angles in seen:
         gaps = np.diff(np.sort(angles), append=angles.min() + 2 * np.pi)
@@ -234,15 +233,11 @@ def test_views_and_halves_of_a_cone_come_from_the_whole_turn(data: TrialData, mo
 def test_as_a_process_it_speaks_lines_of_json(
     tmp_path: Path, data: TrialData, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data.save(tmp_path / "data")
-    job = {"data": str(tmp_path / "data"), "trial": Trial("method", "fbp", 27).as_job(), "seed": 0}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    assert main(tmp_path / "job.json") == 0
+    assert done(data, tmp_path / "one", Trial("method", "fbp", 27)) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["event"] == "result"
-    TrialData(np.zeros_like(data.projections), data.geometry, data.held_out, None).save(tmp_path / "none")
+    views = data.prepared.projections
+    empty = replace(data.prepared, projections=replace(views, data=np.zeros_like(views.data)))
     trial = Trial("method", "r2", 27, settings={"steps": 2, "gaussians": 10})
-    job |= {"data": str(tmp_path / "none"), "trial": trial.as_job()}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    assert main(tmp_path / "job.json") == 1
+    assert done(TrialData(empty, None), tmp_path / "two", trial) == 1
     last = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert last["event"] == "failed" and "no matter" in last["message"]

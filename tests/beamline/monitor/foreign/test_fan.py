@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.monitor.foreign.fan import REACH, Clutter, correlate, covariance, filters, window
+from beamline.monitor.foreign.ghost import REACH, Clutter, correlate, covariance, filters, window
 
 LAGS = (-4, -3, -2, -1, 0, 1, 2, 3, 4)
 CLUTTER = Clutter(speed=0.25, structure=1.0, common=4e-4, noise=2.5e-5)

@@ -260,6 +260,38 @@ def test_virtual_frames_that_cannot_be_read_are_no_zeros(tmp_path: Path, lose: C
         open_scan(path)
 
 
+@pytest.mark.parametrize(
+    "tiles",
+    [
+        [np.s_[:, :2], np.s_[:, 2:]],
+        [np.s_[:, :, :3], np.s_[:, :, 3:]],
+        [np.s_[::2], np.s_[1::2]],
+        [np.s_[:, :2, :2], np.s_[:, 2:, :2], np.s_[:, :, 2:]],
+    ],
+    ids=["rows", "columns", "every second frame", "tiles"],
+)
+def test_virtual_frames_join_the_tiles_of_a_detector(tmp_path: Path, tiles: list[tuple[slice, ...]]) -> None:
+    path = foreign(tmp_path / "f.nxs")
+    with h5py.File(path, "r+") as file:
+        detector = file["entry1/tomo_entry/instrument/detector"]
+        pixels = detector["data"][()]
+        del detector["data"]
+        layout = h5py.VirtualLayout(pixels.shape, pixels.dtype)
+        for n, tile in enumerate(tiles):
+            with h5py.File(tmp_path / f"tile{n}.h5", "w") as part:
+                part["data"] = pixels[tile]
+            layout[tile] = h5py.VirtualSource(f"tile{n}.h5", "data", pixels[tile].shape)
+        detector.create_virtual_dataset("data", layout)
+    with open_scan(path) as source:
+        np.testing.assert_array_equal(source.read(slice(None)), pixels)
+    with h5py.File(tmp_path / "tile1.h5", "r+") as part:  # the writer died, or its disk was full
+        shorter = part["data"][:-1]
+        del part["data"]
+        part["data"] = shorter
+    with pytest.raises(DataError, match=r"frames from.*tile1\.h5"):
+        open_scan(path)
+
+
 @pytest.mark.parametrize("drawn", [h5py.Empty("u2"), np.zeros((3, 3, 3, 3), np.uint16), None], ids=str)
 def test_virtual_frames_of_a_dataset_that_was_replaced_are_refused(
     write: Write, frames: list[Frame], drawn: object

@@ -19,7 +19,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
-from beamline.storage.journal import FileChanges
+from beamline.storage.overlay import Overlay
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout, nxtomo, to_disk
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -114,11 +114,11 @@ def test_no_view_is_begun_where_there_is_no_room_for_it(
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=500))
     writer.close()
     assert len(writer.remarks) == 1
     assert "no /exchange view: " in writer.remarks[0]
-    assert re.search(r"needs \S+ kB on its disk to be changed, 5 kB are free.*1 frames are safe", writer.remarks[0])
+    assert re.search(r"needs \S+ kB on its disk to be changed, 500 B are free.*1 frames are safe", writer.remarks[0])
     with h5py.File(tmp_path / "s.h5") as file:
         assert list(file["exchange"]) == []
         assert file[layout.STATUS][()] == b"complete"
@@ -134,11 +134,11 @@ def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
         writer.append(frame, digest(frame.counts))
     view_of = nxtomo.with_exchange_view
 
-    def look_first(path: Path) -> FileChanges:
+    def look_first(overlay: Overlay) -> Overlay:
         with h5py.File(changed) as file:  # closed, in order, for any program
             assert len(file[layout.DATA]) == len(frames)
         before[0] = changed.read_bytes()
-        return view_of(path)
+        return view_of(overlay)
 
     monkeypatch.setattr(nxtomo, "with_exchange_view", look_first)
     writer.close()
@@ -179,7 +179,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
             writer.append(frame, digest(frame.counts))
             assert begun.wait(60.0)
     assert [rows for _, rows in calls[:14]] == list(range(1, 15))
-    assert (handle, 14) in calls[14:]  # before the file is closed; then come the /exchange view and its journal
+    assert (handle, 14) in calls[14:]  # before the file is closed; then comes the /exchange view
 
 
 def test_a_disk_that_did_not_take_what_was_flushed_is_told(

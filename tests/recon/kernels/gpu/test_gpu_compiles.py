@@ -16,19 +16,21 @@ import pytest
 
 # What a name in a kernel's signature stands for; everything else is a float.
 _INTEGERS = (
-    "n pairs edge tiles_y tiles_x rows cols tile_cols shares nz ny nx bricks_y bricks_x pixels voxels size0 size1 "
-    "size2 size3"
+    "n pairs halvings edge tiles_y tiles_x n_tiles rows cols tile_cols shares nz ny nx bricks_y bricks_x pixels blocks "
+    "voxels size0 size1 size2 size3"
 )
-_INDICES = "boxes owners starts tiles"
+_INDICES, _LONG = "boxes owners starts tiles go", "touched ends needed counts rooms"
+_DOUBLE = "sums variation means"  # of the tally
 _ARRAYS = (
     "means scales rotations densities table moments layers gradient log_scales quaternions raw d_means d_log_scales "
     "d_rotations d_densities d_centres d_quaternions d_raw image target out window source half target_maps partials "
-    "weights terms sums volume p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
+    "weights terms sums volume beam corner weight tv_weight rates vectors "
+    "p0 g0 m0 v0 p1 g1 m1 v1 p2 g2 m2 v2 p3 g3 m3 v3"
 )
 # Those that other kernels call.
 _PARTS = {
     "along_ray", "turned", "shape_of", "add_to", "add_shape", "store_box", "_at_pixels", "_slope", "_unit_quaternion",
-    "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
+    "axes_of", "_softplus", "_sigmoid", "_adam_one", "scaled", "shadow", "body",
 }  # fmt: skip
 
 
@@ -50,7 +52,7 @@ def _compile_all() -> None:
     from triton.compiler import ASTSource
 
     from recon.kernels.cpu.losses import L1, L2, POISSON
-    from recon.kernels.gpu import footprints, images, losses, parameters, rays, tiles, voxels
+    from recon.kernels.gpu import footprints, fused, images, losses, parameters, rays, tiles, voxels
 
     block, pixels = {"BLOCK": footprints._BLOCK}, {"BLOCK": losses._BLOCK}
     of_a_kernel = [
@@ -86,7 +88,10 @@ def _compile_all() -> None:
         (parameters, "_activate", 4, block),
         *((tiles, name, 4, {"AXES": n, "BLOCK": 256}) for name in ("_touched", "_tile_of_pairs") for n in (2, 3)),
         (parameters, "_activation_backward", 4, block),
-        (parameters, "_adam", 4, {"BLOCK": 4 * parameters._BLOCK}),
+        (tiles, "_starts", 4, {"BLOCK": 256}),
+        *((parameters, "_adam", 4, {"BLOCK": 4 * parameters._BLOCK, "GUARDED": guarded}) for guarded in (False, True)),
+        *((parameters, "_add_lengths", 4, block | {"GUARDED": guarded}) for guarded in (False, True)),
+        *((fused, "_tally", 4, {"VIEWS": 2, "LISTS": 2 + boxed, "BOXED": boxed}) for boxed in (False, True)),
     ]
     modules = {module for module, *_ in wanted}
     kernels = {
@@ -104,8 +109,10 @@ def _compile_all() -> None:
                 signature[argument], values[(position,)] = "constexpr", constants[argument]
             elif argument in _INTEGERS.split():
                 signature[argument] = "i32"
-            elif argument in ("touched", "ends"):
+            elif argument in _LONG.split():
                 signature[argument] = "*i64"
+            elif name == "_tally" and argument in _DOUBLE.split():
+                signature[argument] = "*fp64"
             elif argument in _INDICES.split():
                 signature[argument] = "*i32"
             else:

@@ -63,7 +63,7 @@ def test_total_variation_and_gradient_equal_the_reference(
     rng: np.random.Generator, shape: tuple[int, int, int]
 ) -> None:
     volume = torch.from_numpy(rng.normal(size=shape).astype(np.float32))
-    value, gradient = engine.losses.total_variation(volume.to(DEVICE), 0.3)
+    value, gradient = engine.total_variation(volume.to(DEVICE), 0.3)
     if volume.numel() == 1:
         assert float(value) == 0 and not gradient.any()
         return

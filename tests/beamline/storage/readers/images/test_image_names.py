@@ -88,6 +88,30 @@ def test_other_numbers_in_names_are_no_angles() -> None:
     assert angles_of([]) is None
 
 
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "s_{i:06d}_img.tif", "scan_{i:04d}.ome.tif", "{i:04d}_scan.tif", "scan_{i:04d}_20keV.tif",
+        "scan_{i:04d}(1).tif", "scan ({i}).tif", "scan_{i}_20240101_1200{i:02d}.tif", "run2_{i:04d}_{date}.tif",
+        "sub3/{i}_bin2.tif",
+    ],
+)  # fmt: skip
+def test_the_number_of_an_image_stands_anywhere_in_its_name(tmp_path: Path, pattern: str) -> None:
+    names = [pattern.format(i=i, date=20240101 + i // 5) for i in range(8, 8 + VIEWS) if i != 12]
+    _written(tmp_path, names)
+    with open_scan(tmp_path) as source:
+        assert source.read(range(VIEWS - 1))[:, 0, 0].tolist() == list(range(VIEWS - 1))
+        assert source.attributes["missing_numbers"] == "12"
+        assert source.ending.missing == (4,)
+
+
+@pytest.mark.parametrize("pattern", ["tile{tile}_{i:04d}.tif", "{i:04d}_{tile}keV.tif", "tile{tile}_{of_tile:04d}.tif"])
+def test_two_numbers_that_do_not_go_along_are_several_series(tmp_path: Path, pattern: str) -> None:
+    _written(tmp_path, [pattern.format(tile=i // 6, i=i, of_tile=i % 6) for i in range(VIEWS)])
+    with pytest.raises(DataError, match=r"several series.*--frames darks=0:5"):
+        open_scan(tmp_path)
+
+
 def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
     names = [f"a_{i}.tif" for i in range(3)] + [f"dark_{i}.tif" for i in range(2)]
     _written(tmp_path, names)

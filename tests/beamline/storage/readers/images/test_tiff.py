@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 import tracemalloc
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -292,3 +294,24 @@ def test_complex_pixels_are_refused(tmp_path: Path, series: tuple[Path, np.ndarr
     tifffile.imwrite(series[0] / "dark_0.tif", waves[0], photometric="minisblack")
     with pytest.raises(DataError, match=r"dark_0\.tif in .* holds complex numbers"):
         open_scan(series[0])
+
+
+def _packed(path: Path) -> None:
+    """A TIFF of 12-bit pixels without gaps, as cameras' software writes them."""
+    data = bytes(3 * SHAPE[0] * SHAPE[1] // 2)
+    tags = [(256, 3, SHAPE[1]), (257, 3, SHAPE[0]), (258, 3, 12), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1)]
+    tags += [(278, 3, SHAPE[0]), (279, 4, len(data))]
+    entries = b"".join(struct.pack("<HHII", tag, kind, 1, value) for tag, kind, value in tags)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data)) + data + struct.pack("<H", 9) + entries + bytes(4))
+
+
+@pytest.mark.skipif(find_spec("imagecodecs") is not None, reason="it unpacks them")
+def test_packed_pixels_are_refused_in_words(tmp_path: Path) -> None:
+    for i in range(3):
+        _packed(tmp_path / f"s/a_{i}.tif")
+    for path in (tmp_path / "s", tmp_path / "s/a_0.tif"):
+        with pytest.raises(DataError, match=r"packed, 12 bits each.*imagecodecs"):
+            open_scan(path)
+    with pytest.raises(DataError, match=r"packed, 12 bits each"):
+        load_images(tmp_path / "s", FrameKind.DARK)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
 from simulators.samples.builders.packed.arrangement import _near, arrange, bodies_of
-from simulators.samples.builders.packed.grains import Habit, grain
+from simulators.samples.builders.packed.cathode import Habit, grain
 from tests.simulators.bodies import volume
 
 

@@ -14,8 +14,17 @@ from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.light.beam import Beam
 from simulators.samples.bodies.solids import Ellipsoid
-from simulators.samples.builders.packed.cathode import GREY, Cathode
-from simulators.samples.builders.packed.grains import Habit, Sizes, core, crack, grain, grains, inner_radius
+from simulators.samples.builders.packed.cathode import (
+    GREY,
+    Cathode,
+    Habit,
+    Sizes,
+    core,
+    crack,
+    grain,
+    grains,
+    inner_radius,
+)
 from simulators.samples.composed.phantoms import build_sample
 from simulators.samples.materials.palette import known
 from tests.simulators.bodies import volume

@@ -1,0 +1,281 @@
+"""The newest run of a folder for control systems: its values with the time and the alarm of what set each last."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+from beamline.core.errors import ConfigError, DataError, user_message
+from beamline.core.events import event_in
+from beamline.core.text import one_line
+from beamline.page.recording import Recording
+from beamline.page.run_files import Reader, watched
+from beamline.scan.runs import DIED, newest
+from beamline.scan.states import State
+from beamline.storage.hdf5 import NotReadyError
+
+Event = Mapping[str, Any]
+PERIOD = 0.5  # s between two looks at the run
+LONGEST = 1000  # characters of a text
+
+
+def published(name: str, about: str, default: Any, unit: str = "") -> Any:
+    """A field that control systems see under this name, with its meaning and unit as metadata."""
+    return field(default=default, metadata={"name": name, "about": about, "unit": unit})
+
+
+@dataclass(frozen=True)
+class RunValues:
+    """The present values of a run, which control systems see. Numbers are NaN or -1 where they are not known.
+
+    Names that tomoscan (APS) has are as there.
+    """
+
+    run: str = published("Run", "folder of the run", "")
+    sample: str = published("SampleName", "name of the sample", "")
+    file: str = published("FileName", "scan file", "")
+    state: str = published("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done, died ...", "idle")
+    message: str = published("Message", "what the scan said last", "")
+    planned: int = published("ImagesPlanned", "frames that the scan takes in all", -1)
+    exposed: int = published("ImagesCollected", "frames exposed", 0)
+    stored: int = published("ImagesSaved", "frames in the file", 0)
+    percent: float = published("PercentComplete", "of the frames planned", 0.0, "%")
+    rate: float = published("FrameRate", "frames a second", math.nan, "Hz")
+    time_left: float = published("RemainingTime", "until the last frame", math.nan, "s")
+    mean: float = published("MeanCounts", "of the newest frame", math.nan, "counts")
+    beam: float = published("Beam", "last reading of the beam monitor", math.nan)
+    warnings: int = published("Warnings", "flags of the monitor that warn", 0)
+    alarms: int = published("Alarms", "flags of the monitor that are alarms", 0)
+    last_flag: str = published("LastFlag", "check, frame and advice of the last flag", "")
+    views: int = published("ReconViews", "views in the live volume", 0)
+    free: float = published("DiskFree", "of the disk with the scan file", math.nan, "GB")
+    age: float = published("FrameAge", "since the last frame came into the file", math.nan, "s")
+    data_rate: float = published("DataRate", "data a second", math.nan, "MB/s")
+    residual: float = published("ReconResidual", "of the views that the live volume has not learnt", math.nan)
+    skipped: int = published("SkippedLines", "lines of the log that are no events", 0)
+    angle: float = published("Angle", "of the newest frame in the file", math.nan, "deg")
+    flag_names: tuple[str, ...] = published("FlagNames", "checks of the monitor that flagged frames", ())
+    flag_counts: tuple[int, ...] = published("FlagCounts", "flags of each of FlagNames", ())
+
+
+class Severity(IntEnum):
+    """Severities of alarms, as in EPICS."""
+
+    NO_ALARM = 0
+    MINOR = 1
+    MAJOR = 2
+    INVALID = 3
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """When a value was so, s since the Unix epoch, and its alarm."""
+
+    time: float
+    severity: Severity = Severity.NO_ALARM
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class StampedValues:
+    """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
+
+    Attributes:
+        began: time of what nothing has set yet, s since the Unix epoch.
+        unread: why the file cannot be read any more, so that its values are old; "" where it can.
+    """
+
+    values: RunValues
+    began: float
+    stamps: Mapping[str, Stamp] = field(default_factory=dict)
+    unread: str = ""
+
+    def stamp(self, name: str) -> Stamp:
+        """The stamp of a value: INVALID where the value is not known, or is one of a file that cannot be read."""
+        value, stamp = getattr(self.values, name), self.stamps.get(name, Stamp(self.began))
+        if value == -1 or value != value:
+            return replace(stamp, severity=Severity.INVALID, message="not known")
+        if self.unread and name in _OF_FILE:
+            return replace(stamp, severity=Severity.INVALID, message=self.unread)
+        return stamp
+
+    def after(self, lines: Iterable[str]) -> StampedValues:
+        """The values after these further lines of the log."""
+        values, stamps = self.values, dict(self.stamps)
+        for line in lines:
+            event = event_in(line) or {}
+            with suppress(KeyError):  # a field is not there
+                at, taken, severity = float(event["time"]), event_values(values, event), _severity(event)
+                texts = {name: one_line(value, LONGEST) for name, value in taken.items() if isinstance(value, str)}
+                values = replace(values, **{**taken, **texts})
+                for name in taken:
+                    worst = severity if name in _ALARMED else Severity.NO_ALARM
+                    stamps[name] = Stamp(at, worst, values.message if worst else "")
+        return replace(self, values=values, stamps=stamps)
+
+    def with_file(self, seen: Mapping[str, Any], angle: float, now: float) -> StampedValues:
+        """The same with what the file says at the time `now`.
+
+        Args:
+            seen: see `page.run_files.Reader.state`.
+            angle: of the newest frame, degrees.
+        """
+        before, stored, status = self.values, int(seen["frames"]), str(seen["status"])
+        frame = Stamp(now if seen["newest"] is None else float(seen["newest"]))
+        taken: dict[str, Any] = {"stored": stored, "angle": angle, "free": seen["free"] / 1e9, "age": seen["age_s"]}
+        taken["percent"] = 100.0 * stored / before.planned if before.planned > 0 else before.percent
+        taken["skipped"] = seen.get("skipped_lines", 0)
+        stamps = {**self.stamps, **dict.fromkeys(_OF_FILE, frame), "free": Stamp(now), "age": Stamp(now)}
+        ended = status == DIED or (not before.run and status != "running")  # the log does not say how it ended
+        if ended and status != before.state:
+            why = one_line(seen["next"], LONGEST)
+            taken |= {"state": status, "message": why}
+            stamps["state"] = stamps["message"] = Stamp(now, _OF_STATE.get(status, Severity.NO_ALARM), why)
+        return replace(self, values=replace(before, **taken), stamps=stamps, unread="")
+
+
+_OF_FILE = ("stored", "percent", "angle", "free", "age")
+_ALARMED = ("state", "message", "last_flag", "warnings", "alarms")
+"""Values whose severity is that of the event that set them."""
+_OF_STATE: Mapping[str, Severity] = {
+    State.FAILED: Severity.MAJOR, DIED: Severity.MAJOR, State.ABORTED: Severity.MAJOR,
+    State.STOPPED: Severity.MINOR, State.PAUSED: Severity.MINOR,
+}  # fmt: skip
+_OF_LEVEL = {"alarm": Severity.MAJOR, "warn": Severity.MINOR}
+
+
+def _severity(event: Event) -> Severity:
+    """The severity of an event, by its state, level or kind."""
+    kind = event["event"]
+    if kind == "state":
+        return _OF_STATE.get(event["state"], Severity.NO_ALARM)
+    if kind == "flag":
+        return _OF_LEVEL.get(event.get("level", ""), Severity.NO_ALARM)
+    return {"failed": Severity.MAJOR, "warning": Severity.MINOR}.get(kind, Severity.NO_ALARM)
+
+
+class FollowedRun:
+    """The newest run of a folder, also one that begins later. Calls may come from any thread.
+
+    Args:
+        now: a clock, s since the Unix epoch.
+
+    Attributes:
+        stamped: its values, as of the last look.
+    """
+
+    def __init__(self, runs: Path, now: Callable[[], float] = time.time) -> None:
+        self.runs, self._now = runs, now
+        self._lock = threading.Lock()
+        self._reader: Reader | None = None
+        self._lines = 0
+        self.stamped = StampedValues(RunValues(), now())
+
+    def close(self) -> None:
+        with self._lock:
+            if self._reader is not None:
+                self._reader.close()
+                self._reader = None
+
+    def reader(self) -> Reader:
+        """Of the run's files. DataError: there is no run so far."""
+        with self._lock:
+            if self._reader is None:
+                raise DataError("There is no run so far.")
+            return self._reader
+
+    def look(self) -> StampedValues:
+        """The values now."""
+        with self._lock:
+            with suppress(ConfigError, DataError):  # no run so far
+                self.stamped = self._read()
+            return self.stamped
+
+    def _read(self) -> StampedValues:
+        what, stamped = watched(newest(self.runs)), self.stamped
+        if self._reader is None or self._reader.what != what:
+            if self._reader is not None:
+                self._reader.close()
+            self._reader, self._lines = Reader(what), 0
+            stamped = StampedValues(RunValues(), self._now())
+        seen, angle, why = None, math.nan, ""
+        try:
+            seen = self._reader.state()
+            angle = self._reader.do(_newest_angle) if seen["frames"] else math.nan
+        except (DataError, NotReadyError, OSError) as error:
+            why = user_message(error)
+        lines = self._reader.events.lines
+        stamped, self._lines = stamped.after(lines[self._lines :]), len(lines)
+        return replace(stamped, unread=why) if seen is None else stamped.with_file(seen, angle, self._now())
+
+
+def _newest_angle(recording: Recording) -> float:
+    """Degrees."""
+    angles = recording.columns(max(recording.progress().frames - 1, 0))["angle"]
+    return math.nan if not angles or angles[-1] is None else float(angles[-1])
+
+
+def event_values(before: RunValues, event: Event) -> dict[str, Any]:
+    """The values that an event sets, by name; {} if it sets none. Numbers that are not known are NaN.
+
+    Raises:
+        KeyError: the event lacks a field.
+    """
+    values = _BY_KIND.get(str(event.get("event")))
+    return {} if values is None else values(before, event)
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _run(before: RunValues, event: Event) -> dict[str, Any]:
+    return {
+        "run": str(event["folder"]), "sample": str(event["sample"]), "file": str(event["path"]),
+        "planned": int(event["n_frames"]), "warnings": 0, "alarms": 0, "flag_names": (), "flag_counts": (),
+    }  # fmt: skip
+
+
+def _state(before: RunValues, event: Event) -> dict[str, Any]:
+    if event.get("source") == "recon":  # of the live volume
+        return {}
+    return {"state": str(event["state"]), "message": str(event.get("message", ""))}
+
+
+def _frame(before: RunValues, event: Event) -> dict[str, Any]:
+    return {
+        "exposed": int(event["n"]), "rate": _number(event["frames_per_s"]), "data_rate": _number(event["mb_per_s"]),
+        "time_left": _number(event["eta_s"]), "mean": _number(event.get("mean")),
+    }  # fmt: skip
+
+
+def _flag(before: RunValues, event: Event) -> dict[str, Any]:
+    if "check" not in event:  # a rule of the file
+        return {}
+    counts = Counter(dict(zip(before.flag_names, before.flag_counts, strict=True)))
+    counts[str(event["check"])] += 1
+    last = f"{event['check']} {event['level']}, frame {event['frame']}: {event['advice']}"
+    counted = {"alarm": {"alarms": before.alarms + 1}, "warn": {"warnings": before.warnings + 1}}
+    names = {"last_flag": last, "flag_names": (*counts,), "flag_counts": (*counts.values(),)}
+    return {**names, **counted.get(event["level"], {})}
+
+
+_BY_KIND: dict[str, Callable[[RunValues, Event], dict[str, Any]]] = {
+    "run_started": _run,
+    "state": _state,
+    "frame": _frame,
+    "flag": _flag,
+    "beam": lambda before, event: {"beam": _number(event["value"])},
+    "warning": lambda before, event: {"message": str(event["message"])},
+    "failed": lambda before, event: {} if "source" in event else {"message": str(event["message"])},
+    "snapshot": lambda before, event: {"views": int(event["n_views"]), "residual": _number(event.get("unlearnt"))},
+    "scan_done": lambda before, event: {"time_left": 0.0, "rate": math.nan, "data_rate": math.nan},
+}

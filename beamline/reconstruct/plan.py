@@ -1,0 +1,168 @@
+"""Plan: memory, disk and slabs of a reconstruction, and what is refused because of them.
+
+A run follows the plan that its dry run states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from beamline.core.errors import DataError
+from beamline.core.text import size
+from beamline.projections.prepare import refuse_spilled
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import cone_of
+from beamline.reconstruct.error_bars import refuse_views
+from beamline.reconstruct.memory import (
+    ReconMemory,
+    memory_of,
+    refuse_few_views,
+    refuse_slabs,
+    refuse_smallest,
+    refuse_whole,
+    surely_weighted,
+)
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.region import Region, locate
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.writers.partial_volume import slabs_of_partial
+from recon.base.geometry import Geometry
+from recon.base.slabs import Slab, slabs_of
+from recon.base.volume import Grid
+
+
+@dataclass(frozen=True)
+class ReconPlan:
+    """How a reconstruction uses memory and disk.
+
+    Attributes:
+        needs: of the views, as far as they are known.
+        allowed: bytes of memory that may be used.
+        slabs: in which the volume is made; none: at once.
+        missing: those that a partial volume lacks; all without one.
+        output, scratch: bytes on the disk for the result, and beside it while it is made.
+    """
+
+    needs: ReconMemory
+    allowed: int
+    slabs: Sequence[Slab]
+    missing: Sequence[Slab]
+    output: int
+    scratch: int
+
+    @property
+    def memory(self) -> int:
+        """Bytes that are used."""
+        return max(self.needs.slab(self.slabs[0].own.stop), self.needs.least) if self.slabs else self.needs.at_once
+
+    @property
+    def line_integrals(self) -> int:
+        """Bytes of the views on disk."""
+        return self.needs.line_integrals if self.slabs else 0
+
+
+def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> ReconPlan:
+    """The plan before a frame is read.
+
+    Args:
+        needs: as `recon_memory_of` says.
+
+    Raises:
+        ConfigError: an option needs more memory than there is.
+        DataError: the smallest slab does not fit, a cone does not fit at once, or slabs of an earlier call are there.
+    """
+    allowed, at_once = memory_of(options), needs.at_once
+    _refuse_views(source, options, needs.geometry)
+    if options.selection.axis_col is not None or source.axis_col is not None or needs.geometry.is_cone:
+        _refuse_region(options, needs.geometry)
+    if at_once <= allowed and options.partial is None:
+        return _plan(options, needs, allowed)
+    refuse_spilled(source)
+    if options.partial is None:
+        options.target.refuse_partial()
+    if not options.method.traits.several and cone_of(source, options.selection) is not None:
+        raise DataError(
+            f"{source.path}: {options.method.name} would take {size(at_once)}, {size(allowed)} of memory may be used, "
+            "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
+        )
+    refuse_whole(source, options, needs, allowed)
+    needs = replace(needs, weighted=surely_weighted(source, options))
+    return _in_slabs(source, options, needs, allowed)
+
+
+def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepared: PreparedProjections) -> ReconPlan:
+    """The plan for the views as they were read.
+
+    Args:
+        plan: before they were.
+
+    Raises:
+        DataError: the volume does not fit, as its axis was found near an edge.
+    """
+    geometry = prepared.geometry
+    differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
+    weighted = differ and not options.method.traits.direct
+    needs = ReconMemory(options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty)
+    if plan.slabs:
+        return _in_slabs(source, options, needs, plan.allowed)
+    if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
+        raise DataError(
+            f"{source.path}: the rotation axis was found at column {prepared.axis_col:.2f}, off the middle, and the "
+            f"volume that a full turn sees takes {size(needs.at_once)} of memory, {size(plan.allowed)} may be used. "
+            f"Give --axis {prepared.axis_col:.2f}, so that it is made in slabs. Nothing was written."
+        )
+    return _plan(options, needs, plan.allowed)
+
+
+def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
+    """Raise DataError and ConfigError for the geometry of all views, once the axis is known."""
+    _refuse_views(source, options, geometry)
+    _refuse_region(options, geometry)
+    if options.method.traits.several:
+        needs = ReconMemory(options.method, geometry, 0, True)
+        if needs.at_once > plan.allowed:
+            refuse_whole(source, options, needs, plan.allowed)
+    if plan.slabs and not geometry.is_straight:
+        raise DataError(
+            f"{source.path}: its views are rolled or tilted, and a volume in slabs needs slices aligned with rows. "
+            "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
+        )
+
+
+def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
+    """Raise DataError and ConfigError for views that are too few."""
+    refuse_few_views(source, options, geometry)
+    if options.uncertainty:
+        refuse_views(options.method_for(geometry), geometry)
+
+
+def _refuse_region(options: ReconOptions, geometry: Geometry) -> None:
+    """Raise ConfigError for a region that lies outside the volume."""
+    if isinstance(options.region, Region):
+        locate(options.region, options.selection, geometry)
+
+
+def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, allowed: int) -> ReconPlan:
+    """The slabs for which the memory suffices, or those of a partial volume."""
+    refuse_smallest(source, needs, allowed, options.selection.binning)
+    slices, partial = Grid.matching(needs.geometry).shape[0], options.partial
+    if partial is None:
+        slabs = slabs_of(slices, needs.height(allowed), needs.method.traits.halo)
+        return _plan(options, needs, allowed, slabs, slabs)
+    slabs, missing = slabs_of_partial(partial)
+    if slabs[-1].own.stop != slices:
+        raise DataError(f"{partial} is of {slabs[-1].own.stop} slices, this volume has {slices}.")
+    refuse_slabs(partial, slabs, needs, allowed)
+    return _plan(options, needs, allowed, slabs, missing)
+
+
+def _plan(
+    options: ReconOptions,
+    needs: ReconMemory,
+    allowed: int,
+    slabs: Sequence[Slab] = (),
+    missing: Sequence[Slab] = (),
+) -> ReconPlan:
+    output, scratch = options.disk_needs(needs.volume, in_slabs=bool(slabs))
+    return ReconPlan(needs, allowed, slabs, missing, output, scratch)

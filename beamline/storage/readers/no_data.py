@@ -1,0 +1,92 @@
+"""Detectors of several modules: pixels in the gaps hold a mark instead of counts, and photon counters have no dark."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.storage.readers.base import WHOLE, Attributes, NotUsed, ScanSource, read_known
+from beamline.storage.readers.wrapped import WrappedSource
+from drivers.base.frame import FrameKind
+from recon.base.arrays import Mask
+
+_LOOKED_AT = 3  # frames of a kind
+_UNLIT = 0.05  # of the bright part of a flat: darker pixels tell little of the noise of light
+_PHOTONS = 0.02  # by which the variance of counted photons may differ from their mean, beside its own error
+_ERRORS = 2.5  # standard deviations of that error
+_FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
+
+
+class MarkedSource(WrappedSource):
+    """A ScanSource whose pixels without data are 0 in all frames, also in flats: what has no light is filled."""
+
+    def __init__(self, base: ScanSource, no_data: Mask) -> None:
+        super().__init__(base)
+        self._no_data = no_data
+        self._update()
+        self.counter = not (base.image_key == FrameKind.DARK).any() and counts_photons(self)
+        """It is one of photons, whose dark is 0 and absent."""
+
+    @property
+    def attributes(self) -> Attributes:
+        of_darks = {"darks": "0, as flats vary as counted photons do"} if self.counter else {}
+        marked = f"{self._no_data.mean():.2%}, filled from their neighbours"
+        return {**self._base.attributes, "pixels_without_data": marked, **of_darks}
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return tuple(field for field in self._base.not_used if field.where != "detector/pixel_mask")
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        pixels = self._base.read(frames, rows)
+        pixels[:, self._no_data[rows]] = 0
+        return pixels
+
+
+def no_data_of(source: ScanSource) -> Mask | None:
+    """bool [row, col], pixels that the file's mask, or the end of their type of 32 bits in all frames, marks.
+
+    Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. A type
+    of 16 bits may end by too much light. None where nothing is marked, or more than half.
+    """
+    if source.dtype.kind not in "iu":
+        return None
+    marked = np.zeros(source.shape, np.bool_) if source.pixel_mask is None else source.pixel_mask.copy()
+    if source.dtype.itemsize >= 4:
+        marked |= _at_the_end(source)
+    return marked if 0 < marked.mean() < 0.5 else None
+
+
+def _at_the_end(source: ScanSource) -> Mask:
+    """Pixels that hold a mark in some flats and views of all the scan."""
+    marked = np.ones(source.shape, np.bool_)
+    for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
+        rows = np.flatnonzero(source.image_key == kind)
+        for row in np.unique(rows[np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int)]) if rows.size else ():
+            image = read_known(source, [int(row)])[0]
+            marked &= image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max
+            if not marked.any():
+                return marked
+    return marked
+
+
+def counts_photons(source: ScanSource) -> bool:
+    """Whether flats vary from frame to frame as counted photons: by their mean, so that no offset is in them.
+
+    Of a camera the variance over the mean is its gain, times the share of the light in its counts.
+    """
+    rows = np.flatnonzero(source.image_key == FrameKind.FLAT)[: 2 * _LOOKED_AT]
+    if rows.size < 2 or source.dtype.kind not in "iu":
+        return False
+    flats = read_known(source, rows).reshape(rows.size, -1).astype(np.float64)
+    mean = flats.mean(axis=0)
+    lit = mean > _UNLIT * np.percentile(mean, 90)
+    level = flats[:, lit].mean(axis=1)
+    pairs = (rows.size - 1) * int(lit.sum())
+    if pairs < _FEWEST or not level.min() > 0:
+        return False
+    even = flats[:, lit] * (level.mean() / level)[:, None]
+    ratio = float(np.square(np.diff(even, axis=0)).mean() / 2 / level.mean())
+    return abs(ratio - 1) < _PHOTONS + _ERRORS * np.sqrt(2 / pairs)

@@ -1,0 +1,268 @@
+"""Files that makers of CT scanners write beside their images: distances, pixel size, angles and white level.
+
+Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON and the .xml of Diondo, by keys that
+public readers use (TIGRE, CIL). A key that is not there is not guessed.
+"""
+
+from __future__ import annotations
+
+import configparser
+import json
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import SETTINGS, decoded, require_regular
+from beamline.storage.readers.base import NotUsed, ScanSource
+from beamline.storage.readers.wrapped import WrappedSource
+from drivers.base.frame import FrameKind
+
+_MOST = 20  # files beside a scan that are looked at
+
+
+@dataclass(frozen=True)
+class MakerKeys:
+    """Where a maker's file has what we need, as "section/key" in small letters; "" for what it does not state.
+
+    Attributes:
+        sod, sdd: distances from the source to the axis and to the detector, mm.
+        pixel: width of a pixel in mm, times `unit`; at the sample where `at_sample`.
+        count: of the projections.
+        step, span: degrees from one to the next, or of all.
+        first: degrees of the first one.
+        white: counts of the open beam.
+        scale: a factor of both distances.
+        helix: keys that say "true" where the source goes round on another path than a circle.
+    """
+
+    maker: str
+    suffix: str
+    sod: str
+    sdd: str
+    pixel: str
+    count: str
+    unit: float = 1.0
+    at_sample: bool = False
+    step: str = ""
+    span: str = ""
+    first: str = ""
+    white: str = ""
+    scale: str = ""
+    helix: tuple[str, ...] = ()
+
+
+_YXLON = "conebeamscanparameter/scantrajectory/"
+MAKERS = (
+    MakerKeys(
+        "Nikon", ".xtekct", "xtekct/srctoobject", "xtekct/srctodetector", "xtekct/detectorpixelsizex",
+        "xtekct/projections", step="xtekct/angularstep", first="xtekct/initialangle", white="xtekct/whitelevel",
+    ),
+    MakerKeys(
+        "SkyScan", ".log", "acquisition/object to source (mm)", "acquisition/camera to source (mm)",
+        "acquisition/image pixel size (um)", "acquisition/number of files", unit=1e-3, at_sample=True,
+        step="acquisition/rotation step (deg)",
+    ),
+    MakerKeys(
+        "GE phoenix", ".pca", "geometry/fod", "geometry/fdd", "geometry/voxelsizex", "ct/numberimages", at_sample=True,
+        span="ct/rotationsector",
+    ),
+    MakerKeys(
+        "YXLON", ".xml", f"{_YXLON}fod", f"{_YXLON}fdd", "conebeamscanparameter/pixelsize/width",
+        f"{_YXLON}numberofprojections", span=f"{_YXLON}rotation", first=f"{_YXLON}startangle",
+        scale=f"{_YXLON}pixelpitch",
+    ),
+    MakerKeys(
+        "Diondo", ".xml", "geometrie/sourceobjectdist", "geometrie/sourcedetectordist", "recon/projectionpixelsizex",
+        "recon/projectioncount", helix=("scanparameter/helixmode", "scanparameter/laminography"),
+    ),
+)  # fmt: skip
+_ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states none
+
+
+@dataclass(frozen=True, eq=False)
+class SideFile:
+    """What a maker's file states of a scan; None for what it does not.
+
+    Attributes:
+        cone: mm from the source to the rotation axis and to the detector.
+        pixel_mm: width of a pixel on the detector.
+        count: of the projections.
+        angles: float64 [projection] radians.
+        white: counts of the open beam.
+    """
+
+    path: Path
+    maker: str
+    cone: tuple[float, float]
+    pixel_mm: float
+    count: int
+    angles: NDArray[np.float64] | None
+    white: float | None
+
+    def __str__(self) -> str:
+        sod, sdd = self.cone
+        angles = "" if self.angles is None else f", angles from {np.degrees(self.angles[0]):.6g} to "
+        angles += "" if self.angles is None else f"{np.degrees(self.angles[-1]):.6g} degrees"
+        white = "" if self.white is None else f", white level {self.white:g}"
+        return (
+            f"{self.maker}: {self.count} projections, source {sod:g} mm from the axis and {sdd:g} mm from the "
+            f"detector, pixels of {self.pixel_mm:g} mm{angles}{white}"
+        )
+
+
+class SidedSource(WrappedSource):
+    """A ScanSource with the distances and the pixel size of a maker's file."""
+
+    def __init__(self, base: ScanSource, side: SideFile) -> None:
+        """Raises DataError where it is of another number of projections."""
+        super().__init__(base)
+        views = int((base.image_key == FrameKind.PROJECTION).sum())
+        if views != side.count:
+            raise DataError(f"{side.path} is of {side.count} projections; {base.path} holds {views}.")
+        self.cone, self.pixel_size_mm, self.row_pitch_mm = side.cone, side.pixel_mm, None
+        self._side = side
+        self._update()
+
+    @property
+    def attributes(self) -> Mapping[str, str | float | int]:
+        return {**self._base.attributes, "from": f"{self._side.path.name}, {self._side}"}
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return tuple(field for field in self._base.not_used if field.where != self._side.path.name)
+
+    def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:
+        return self._base.read(frames, rows)
+
+
+def read_side_file(path: Path) -> SideFile:
+    """Read a maker's file.
+
+    Raises:
+        DataError: it is none of those, or lacks a distance, the pixel size or the number of projections.
+    """
+    try:
+        values = _values(path)
+    except (OSError, ValueError, configparser.Error, ElementTree.ParseError, RecursionError) as error:
+        raise DataError(f"{path} cannot be read as a file of a CT scanner ({error}).") from error
+    for keys in MAKERS:
+        if keys.suffix == path.suffix.lower() and keys.sod in values:
+            return _side_file(path, keys, values)
+    known = ", ".join(f"{keys.maker} {keys.suffix}" for keys in MAKERS)
+    raise DataError(f"{path} is no file of a CT scanner that is read ({known}).")
+
+
+def side_of(source: ScanSource) -> SideFile | None:
+    """The maker's file in or beside a folder of images, or a TIFF, if one alone is of as many projections."""
+    if not source.format.startswith("tiff"):
+        return None
+    views, found = int((source.image_key == FrameKind.PROJECTION).sum()), []
+    for path in _candidates(source.path):
+        with suppress(DataError):
+            found.append(read_side_file(path))
+    found = [side for side in found if side.count == views]
+    return found[0] if len(found) == 1 else None
+
+
+def offered(source: ScanSource) -> tuple[NotUsed, ...]:
+    """What a maker's file beside these images states."""
+    side = side_of(source)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"--from {side.path} takes it", True),)
+
+
+def _candidates(scan: Path) -> Iterator[Path]:
+    suffixes, n = {keys.suffix for keys in MAKERS}, 0
+    for folder in (scan, scan.parent) if scan.is_dir() else (scan.parent,):
+        for path in sorted(folder.glob("*.*")):
+            if path.suffix.lower() in suffixes and n < _MOST and path.is_file():
+                n += 1
+                yield path
+
+
+def _values(path: Path) -> dict[str, str]:
+    """Texts by "section/key" in small letters, of an INI, JSON or XML file."""
+    text, values = _text(path), dict[str, str]()
+    if path.suffix.lower() == ".xml":
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ValueError("it defines entities")
+        _of_element(ElementTree.fromstring(text), "", values)
+    elif text.lstrip().startswith("{"):
+        _of_json(json.loads(text), "", values)
+    else:
+        parser = configparser.RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",))
+        parser.read_string(text.lstrip("\ufeff"))
+        values = {
+            f"{section}/{key}".lower(): value or "" for section in parser for key, value in parser[section].items()
+        }
+    return values
+
+
+def _text(path: Path) -> str:
+    """The content of a small file, also where a program of Windows wrote its own characters."""
+    require_regular(path, SETTINGS)
+    content = path.read_bytes()
+    try:
+        return decoded(content)
+    except UnicodeDecodeError:
+        return content.decode("cp1252", "replace")
+
+
+def _of_element(element: ElementTree.Element, path: str, values: dict[str, str]) -> None:
+    for child in element:
+        name = f"{path}{child.tag.rpartition('}')[2].lower()}"
+        values.setdefault(name, (child.text or "").strip())
+        _of_element(child, f"{name}/", values)
+
+
+def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
+    for key, value in item.items():
+        if isinstance(value, dict):
+            _of_json(value, f"{path}{key.lower()}/", values)
+        else:
+            values[f"{path}{key.lower()}"] = str(value)
+
+
+def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
+    def number(key: str) -> float | None:
+        match = re.match(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?", values.get(key, "")) if key else None
+        try:
+            return None if match is None else float(match[0])
+        except ValueError:
+            return None
+
+    if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
+        raise DataError(f"{path} says {other}: its scan is not on a circle, which is not read.")
+    scale = (number(keys.scale) or 1.0) if keys.scale else 1.0
+    given = {name: number(getattr(keys, name)) for name in ("sod", "sdd", "pixel", "count")}
+    if lacking := [getattr(keys, name) for name, value in given.items() if value is None or not value > 0]:
+        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
+    sod, sdd, pixel, count = (float(value or 0) for value in given.values())
+    pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
+    step, span, n = number(keys.step), number(keys.span) or _ROUND.get(keys.maker), int(count)
+    step = step if step is not None or span is None else span / n
+    listed = _listed_angles(path, n) if keys.maker == "Nikon" else None
+    angles = None if step is None else (number(keys.first) or 0.0) + step * np.arange(n)
+    angles = angles if listed is None else listed
+    radians = None if angles is None else np.radians(angles)
+    return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number(keys.white))
+
+
+def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
+    """Degrees of each projection in the `_ctdata.txt` beside Nikon's file; None where it is not there or of others."""
+    files = sorted(path.parent.glob("*_ctdata.txt"))
+    if len(files) != 1:
+        return None
+    try:
+        rows = [line.split("\t") for line in _text(files[0]).splitlines()]
+        listed = [row[1] for row in rows if len(row) >= 3 and row[0].strip().isdigit()]
+        return np.array(listed, np.float64) if len(listed) == n else None
+    except (OSError, ValueError):
+        return None

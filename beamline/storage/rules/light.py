@@ -1,0 +1,175 @@
+"""Light: views and references must be of one light, and each view of one scale; what else explains their counts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.flats_with_sample import lit_places
+from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.references import ReferenceGroups, reference_frame, some_of
+from drivers.base.frame import FrameKind
+from recon.base.arrays import F32
+
+VIEWS = 8  # that are looked at
+AT_THE_ENDS = 1e-3  # share of a view's pixels that its least and its largest number may have, where it was scaled
+ALIKE = 6  # pixels, at most, that had one count by chance before they were scaled
+SPREAD = 16  # grey values between them, at least, where they are whole numbers
+WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its views, others 0.02
+REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
+BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
+NEAR = 0.02  # share by which a factor may be off a whole number that explains it
+LEAST_SHIFT = 4  # 14 bits in 16; half of all frames are even by chance where they hold few counts
+NOISIER = 3.0  # times: photons by the noise of few frames are known to a factor of 1.5
+BRIGHT = 90.0  # percentile of a view's transmission where it is air, or nearest to it
+ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
+TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
+OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
+"""Limits, each with its reason."""
+
+
+def views_scaled(source: ScanSource) -> Iterator[Finding]:
+    """Each view has a scale of its own: it runs from the same least to the same largest number, at other pixels."""
+    rows = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if rows.size < VIEWS:
+        return
+    ends, places = set(), (set[int](), set[int]())
+    for row in some_of(rows, VIEWS).tolist():
+        view = read_known(source, [row])[0]
+        low, high = float(view.min()), float(view.max())
+        ends.add((low, high))
+        whole = view.dtype.kind in "ui"
+        if len(ends) > 1 or not high - low >= (SPREAD if whole else 1e-30):
+            return
+        if max(np.count_nonzero(view == low), np.count_nonzero(view == high)) > max(ALIKE, AT_THE_ENDS * view.size):
+            return
+        places[0].add(int(view.argmin()))
+        places[1].add(int(view.argmax()))
+    if min(map(len, places)) == 1:  # a dead or a hot pixel
+        return
+    low, high = ends.pop()
+    yield Finding(
+        "error",
+        "light",
+        f"Each of {VIEWS} views looked at runs from {low:g} at its darkest pixel to {high:g} at its brightest, which "
+        "are other pixels in each: every image was scaled by itself, as programs that save pictures do, and a grey "
+        "value means another attenuation in each view. Give the images as the camera wrote them, or all scaled alike.",
+    )
+
+
+def light_beside_flats(
+    source: ScanSource, groups: ReferenceGroups, level: float, air: bool, accepted: bool = False
+) -> Iterator[Finding]:
+    """The air of views has the light of their flats, but for what a beam does within a scan.
+
+    Args:
+        groups: the references that are used.
+        level: line integral of the air, the median of the views; without air, of the place that absorbs least.
+        air: columns of air were found, whose light was taken off.
+        accepted: a fault is a warning.
+    """
+    darker = level > WARN and air
+    if darker or level < -BRIGHTER:
+        where = "The air beside the sample" if air else "The place of the views that absorbs least"
+        what = "taken off as a change of the beam" if air else "not taken off, as no air is known beside the sample"
+        factor = math.exp(abs(level))
+        sentence = (
+            f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats ({level:+.2f} of line "
+            f"integral, {what}); within a scan a beam changes by up to {math.exp(WARN):.2g} times, and a sample only "
+            f"takes light. Were views and references taken or stored alike? {explained(source, groups, factor)}"
+        )
+        refused = abs(level) > REFUSE
+        if refused and not accepted:
+            sentence += " Give references of the views' light, or --references accept, which uses these as they are."
+        yield Finding("error" if refused and not accepted else "warning", "light", sentence)
+    elif not air and (ratio := _noise_ratio(source, groups)) > NOISIER:
+        yield Finding(
+            "warning",
+            "light",
+            f"For their counts the flats have {ratio:.2g} times the noise of the views, which is one figure for all "
+            f"images of a camera, and no air tells which is right: references that were multiplied (by about "
+            f"{ratio:.2g}), or views that are means of several frames? {explained(source, groups, ratio)}",
+        )
+
+
+def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
+    """Sentences on what would explain that views and flats differ by a factor."""
+    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    flats = np.concatenate(groups.flats)
+    seen, flat, dark = (_mean(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
+    lit = lit_places(flat - dark)
+    places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
+    counts = float(np.median(flat[places])), float(np.median(seen[places]))
+    sentences = [f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."]
+    multiples = [_multiple(source, rows) for rows in (flats, views)]
+    if multiples[0] != multiples[1] and max(multiples) >= LEAST_SHIFT:
+        name, most = ("flats", multiples[0]) if multiples[0] > multiples[1] else ("views", multiples[1])
+        sentences.append(f"All counts of the {name} are multiples of {most}, others are not: counts shifted by bits.")
+    elif abs(counts[1] - counts[0] - OFFSET) < NEAR * OFFSET or abs(counts[0] - counts[1] - OFFSET) < NEAR * OFFSET:
+        sentences.append(f"They differ by {OFFSET}, as signed numbers do that were stored without a sign.")
+    else:
+        raw = max(counts) / max(min(counts), 1e-30)
+        whole = next((round(each) for each in (raw, factor) if each > 1.5 and abs(each / round(each) - 1) < NEAR), 0)
+        if whole:
+            sentences.append(f"The factor is about {whole}, as of sums of {whole} frames beside single ones.")
+    exposed = [source.exposures[rows] for rows in (flats, views)]
+    if all(np.isfinite(each).all() for each in exposed):
+        said = [f"{np.median(each):g} s" for each in exposed]
+        sentences.append(f"Stated exposures: flats {said[0]}, views {said[1]}.")
+    else:
+        sentences.append("No exposure is stated for both: flats that were exposed for another time differ so.")
+    return " ".join(sentences)
+
+
+def _mean(source: ScanSource, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Cells of the mean of frames."""
+    cells = [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
+    return np.asarray(np.nan_to_num(np.mean(cells, axis=0)), np.float32)
+
+
+def _multiple(source: ScanSource, rows: NDArray[np.int64]) -> int:
+    """The largest power of two of which all counts of a frame are multiples; 1 of real numbers."""
+    image = read_known(source, [int(rows[0])])[0]
+    if image.dtype.kind not in "ui":
+        return 1
+    common = int(np.gcd.reduce(image.ravel().astype(np.int64)))
+    return common & -common if common else 1
+
+
+def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
+    """Variance over light of the flats, over that of the views; 0 where it is not known.
+
+    Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
+    the sample adds to the variance of views, so that their quietest places count.
+    """
+    middle = source.shape[0] // 2
+    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
+    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    taken = [np.concatenate(groups.darks), some_of(max(groups.flats, key=len), VIEWS), views]
+    darks, flats, seen = (read_known(source, some, rows).astype(np.float32) for some in taken)
+    if len(flats) < LEAST_FLATS:
+        return 0.0
+    light = flats.mean(axis=0) - darks.mean(axis=0)
+    light[~lit_places(light)] = np.nan
+    of_flats, of_views = (
+        np.median([_gain(image - darks.mean(axis=0), light) for image in kind]) for kind in (flats, seen)
+    )
+    ratio = float(of_flats / of_views) * len(flats) / (len(flats) - 1) if of_views > 0 else 0.0
+    return ratio if math.isfinite(ratio) else 0.0
+
+
+def _gain(net: F32, light: F32) -> float:
+    """Variance of counts over their number, in the quietest tiles of an image; NaN where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        change = np.diff(np.diff(net / light, axis=0), axis=1)
+        each = np.where(net > 0, light**2 / net, np.nan)[1:, 1:] * change**2 / 4
+    rows, cols = (n // TILE for n in each.shape)
+    if not rows or not cols:
+        return math.nan
+    tiles = each[: rows * TILE, : cols * TILE].reshape(rows, TILE, cols, TILE).mean(axis=(1, 3))
+    known = tiles[np.isfinite(tiles)]
+    return float(np.percentile(known, QUIET)) if known.size else math.nan

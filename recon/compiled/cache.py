@@ -1,0 +1,86 @@
+"""numba's cache of compiled kernels, such that nothing depends on it.
+
+A kernel is read from the archive that comes with the package, where it lies, else from what numba wrote earlier; else
+it is compiled. A file that is damaged counts as absent and is written anew. Where no folder can be written, or a disk
+is full, kernels are compiled in memory, with one warning.
+
+numba imports this module when it makes its first cache, as LOCATORS names it; nothing else need be imported for it.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from numba.core import caching
+
+from recon.compiled.archive import carried, sealed, unsealed
+
+
+class UnwritableFolder(caching.InTreeCacheLocator):
+    """The `__pycache__` beside a kernel where no folder can be written: what lies there may be read."""
+
+    def ensure_cache_path(self) -> None:
+        """Nothing is written."""
+
+
+class KernelCacheFile(caching.IndexDataCacheFile):
+    """The index of a kernel and its object code, each with a digest; a file without one is taken as numba takes it."""
+
+    def load(self, key: Any) -> Any:
+        files = carried(self._source_stamp)
+        with suppress(Exception):  # a pickle of damaged bytes can raise anything
+            if self._index_name in files:
+                return pickle.loads(files[self._overloads(files[self._index_name])[key]])  # noqa: S301 - our own
+        with suppress(Exception):
+            return super().load(key)
+        return None
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            return self._overloads(unsealed(Path(self._index_path).read_bytes()))
+        except Exception:
+            return {}
+
+    def _overloads(self, content: bytes) -> dict[Any, str]:
+        """Names of files of object code, by what they were compiled for."""
+        file = io.BytesIO(content)
+        if pickle.load(file) != self._version:  # noqa: S301 - numba's, as trustworthy as the modules beside it
+            return {}
+        stamp, overloads = pickle.load(file)  # noqa: S301
+        return dict(overloads) if stamp == self._source_stamp else {}
+
+    def _load_data(self, name: str) -> Any:
+        return pickle.loads(unsealed(Path(self._data_path(name)).read_bytes()))  # noqa: S301
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
+        content = io.BytesIO()
+        yield content
+        with super()._open_for_write(filepath) as file:
+            file.write(sealed(content.getvalue()))
+
+
+@contextmanager
+def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
+    """What the disk refuses stays in memory; the first kernel is told."""
+    try:
+        yield
+    except OSError as error:
+        if not _told:
+            _told.append(cache.cache_path)
+            warnings.warn(
+                f"compiled kernels cannot be kept ({cache.cache_path}: {error.strerror or error}): they are compiled "
+                "in memory, each time. Set NUMBA_CACHE_DIR to a folder that can be written.",
+                stacklevel=2,
+            )
+
+
+_told = list[str]()
+caching.IndexDataCacheFile = KernelCacheFile
+caching.Cache._guard_against_spurious_io_errors = _in_memory_where_refused

@@ -1,1 +1,0 @@
-"""Speed and quality of a standard case on this machine."""

@@ -1,0 +1,47 @@
+"""Wrong commands of new users: the sentence names what the file or the word is, and what to type instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.beamline.cli.small_scan import beamline, left
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+CASES = {
+    "a scan for a configuration": (["scan", "scan.h5", "--dry-run"], 2, ["not a configuration", "beamline info"]),
+    "a scan to view": (["view", "scan.h5"], 5, ["is a scan", "beamline recon scan.h5"]),
+    "a scan to export": (["export", "scan.h5", "-o", "s.tif"], 5, ["is a scan", "beamline recon scan.h5"]),
+    "a volume of Python": (["recon", "volume.npz"], 5, ["saved by Python", "beamline view"]),
+    "NIfTI": (["export", "volume.npz", "-o", "v.nii.gz"], 2, ["NIfTI is read, not written", ".nrrd"]),
+    "half pixels": (["recon", "scan.h5", "--bin", "3.5"], 2, ["'3.5' is no whole number", "x>=1"]),
+    "a sweep of one value": (["sweep", "scan.h5", "tv-weight=0.1"], 2, ["two values", "recon --tv-weight 0.1"]),
+    "the centre": (["sweep", "scan.h5", "center=18:22:1"], 2, ["did you mean axis?"]),
+    "a file for a template": (["config", "init", "my.yaml"], 2, ["config init > my.yaml"]),
+    "a missing colon": (["check", "bad.yaml"], 2, ["bad.yaml:3", "colon is missing"]),
+    "an axis outside": (["recon", "scan.h5", "--axis", "900"], 2, ["column 900", "0 to 39"]),
+    "no such run": (["stop", "nosuch"], 2, ["no folder nosuch", "no scan runs in runs"]),
+    "no such file": (["watch", "nosuch.h5"], 2, ["no file or folder nosuch.h5", "no runs in runs"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_sentence_names_what_it_is_and_what_to_type(case: str, folder: Path) -> None:
+    arguments, code, expected = CASES[case]
+    np.savez(folder / "volume.npz", data=np.zeros((4, 5, 6), np.float32))
+    (folder / "bad.yaml").write_text("camera:\n  driver: simulated\n  exposure_s 0.1\nscan:\n  views: 3\n")
+    before = left(folder)
+    result = beamline(*arguments)
+    assert result.exit_code == code, result.output
+    assert not [words for words in expected if words not in " ".join(result.stderr.split())], result.stderr
+    assert left(folder) == before
+
+
+def test_a_volume_to_reconstruct_is_named_with_its_method(folder: Path) -> None:
+    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "volume.h5", "--no-report").exit_code == 0
+    result = beamline("recon", "volume.h5")
+    assert result.exit_code == 5
+    assert "is a volume, made by fbp" in " ".join(result.stderr.split()) and "beamline view" in result.stderr

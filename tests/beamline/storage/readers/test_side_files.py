@@ -1,0 +1,140 @@
+"""Files of scanners' makers beside images: offered where they fit, taken where they are named, never guessed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.side_files import read_side_file
+
+N, SHAPE = 6, (4, 8)
+NIKON = f"""[XTekCT]
+Name=s
+Projections={N}
+DetectorPixelSizeX=0.2
+SrcToObject=60
+SrcToDetector=300
+WhiteLevel=60000
+AngularStep=60
+InitialAngle=10
+"""
+SKYSCAN = f"""[System]
+Scanner=SkyScan1172
+Camera Pixel Size (um)=      11.32
+[Acquisition]
+Number of Files=  {N}
+Object to Source (mm)=60.000
+Camera to Source (mm)=300.000
+Image Pixel Size (um)=40.00
+Rotation Step (deg)=60.000
+Filter=Al 0.5 mm, 20 °C
+"""
+PHOENIX = f"""[Geometry]
+FDD=300
+FOD=60
+VoxelSizeX=0.04
+[CT]
+NumberImages={N}
+RotationSector=360.00000000
+"""
+PHOENIX_2 = f"""{{"Geometry": {{"FDD": 300.0, "FOD": 60.0, "VoxelSizeX": 0.04}},
+"CT": {{"NumberImages": {N}, "RotationSector": 360.0}}}}"""
+YXLON = f"""<?xml version="1.0"?>
+<ScanParameter xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"><ConeBeamScanParameter>
+<PixelSize><Width>0.2</Width><Height>0.2</Height></PixelSize>
+<ScanTrajectory xsi:type="CircleTrajectory"><PixelPitch>0.2</PixelPitch><Fdd>1500</Fdd><Fod>300</Fod>
+<NumberOfProjections>{N}</NumberOfProjections><StartAngle>10</StartAngle><Rotation>360</Rotation></ScanTrajectory>
+</ConeBeamScanParameter></ScanParameter>"""
+DIONDO = f"""<Scan><ScanParameter><HelixMode>false</HelixMode><Laminography>false</Laminography></ScanParameter>
+<Geometrie><SourceDetectorDist>300</SourceDetectorDist><SourceObjectDist>60</SourceObjectDist></Geometrie>
+<Recon><ProjectionPixelSizeX>0.2</ProjectionPixelSizeX><ProjectionCount>{N}</ProjectionCount></Recon></Scan>"""
+FILES = {
+    "s.xtekct": (NIKON, 10.0),
+    "s.log": (SKYSCAN, 0.0),
+    "s.pca": (PHOENIX, 0.0),
+    "s2.pca": (PHOENIX_2, 0.0),
+    "ScanParameter.xml": (YXLON, 10.0),
+    "diondo.xml": (DIONDO, 0.0),
+}
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    folder = tmp_path / "s"
+    folder.mkdir()
+    for i in range(N):
+        tifffile.imwrite(folder / f"s_{i:04d}.tif", np.full(SHAPE, 50_000 + i, np.uint16))
+    return folder
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])
+def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding: str) -> None:
+    text, first = FILES[name]
+    side = images / name
+    side.write_text(text, encoding=encoding)
+    with open_scan(images) as source:  # not named: nothing of it is used
+        assert (source.cone, source.pixel_size_mm) == (None, None)
+        assert np.isnan(source.angles).all()
+        assert [field.where for field in source.not_used] == [name]
+    assert [f.message for f in validate(images) if f"--from {side}" in f.message]
+    with open_scan(SourceOptions(images, side_file=side, quantity="counts")) as source:
+        assert source.cone == pytest.approx((60, 300))
+        assert source.pixel_size_mm == pytest.approx(0.2)
+        np.testing.assert_allclose(np.degrees(source.angles[-N:]), first + 60 * np.arange(N))
+        assert source.not_used == ()
+        white = [FILES[name][0] == NIKON and each for each in source.read(slice(None))[:, 0, 0].tolist()]
+        assert white[:2] == ([0, 60_000] if FILES[name][0] == NIKON else [False, False])
+
+
+def test_what_is_given_goes_before_a_makers_file(images: Path) -> None:
+    (images / "s.xtekct").write_text(NIKON)
+    flats = np.full((2, *SHAPE), 61_000, np.uint16)
+    given = SourceOptions(images, side_file=images / "s.xtekct", flats=flats, angles=np.arange(N) * 1.0)
+    with open_scan(given) as source:
+        assert source.read([1, 2])[:, 0, 0].tolist() == [61_000, 61_000]
+        np.testing.assert_allclose(source.angles[-N:], np.arange(N))
+
+
+def test_nikons_list_of_angles_goes_before_its_step(images: Path) -> None:
+    (images / "s.xtekct").write_text(NIKON)
+    rows = "".join(f"{i + 1}\t{i * 59.5:.4f}\t{i}\n" for i in range(N))
+    (images / "_ctdata.txt").write_text(f"CT data\nParameters\n{N}\t0\nProj\tAngle(deg)\tTime(s)\n{rows}")
+    side = read_side_file(images / "s.xtekct")
+    assert side.angles is not None
+    np.testing.assert_allclose(np.degrees(side.angles), 59.5 * np.arange(N))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("s.xtekct", NIKON.replace("SrcToDetector", "Other"), "states no xtekct/srctodetector"),
+        ("s.xtekct", NIKON.replace("=60\nSrc", "=-60\nSrc"), "states no xtekct/srctoobject"),
+        ("s.xtekct", "no section\n", "cannot be read as a file of a CT scanner"),
+        ("s.xtekct", NIKON.replace(f"Projections={N}", "Projections=7"), "is of 7 projections; .* holds 6"),
+        ("diondo.xml", DIONDO.replace("HelixMode>false", "HelixMode>true"), "helixmode: its scan is not on a circle"),
+        ("s.xml", "<a><b></a>", "cannot be read as a file of a CT scanner"),
+        ("s.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines entities"),
+        ("s.log", "[System]\nuser=root\n", "no file of a CT scanner that is read"),
+    ],
+)
+def test_a_file_that_does_not_say_enough_is_refused_and_not_offered(
+    images: Path, name: str, text: str, message: str
+) -> None:
+    (images / name).write_text(text)
+    with pytest.raises(DataError, match=message):
+        open_scan(SourceOptions(images, side_file=images / name))
+    with open_scan(images) as source:
+        assert source.not_used == ()
+
+
+def test_a_refusal_names_the_file_that_would_help(images: Path) -> None:
+    (images / "s.xtekct").write_text(NIKON)
+    with pytest.raises(DataError, match=r"transmission.*Beside it lies s\.xtekct: --from .*s\.xtekct takes it"):
+        open_scan(SourceOptions(images, quantity="transmission"))

@@ -1,0 +1,81 @@
+"""Kinds of frames that a caller says, and scans in several files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.core.errors import DataError
+from beamline.storage.readers.open import SourceOptions, open_scan
+from drivers.base.frame import FrameKind
+
+DARK, FLAT, VIEW, NONE = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION, FrameKind.INVALID
+SHAPE = (4, 6)
+
+
+@pytest.fixture
+def series(tmp_path: Path) -> Path:
+    """Ten images numbered through, of which the names of the first three and the last say nothing that is known."""
+    folder = tmp_path / "s"
+    folder.mkdir()
+    for i in range(10):
+        what = "ref" if i in (0, 1, 2, 9) else "dark_chocolate"
+        tifffile.imwrite(folder / f"s_{i + 5:03d}_{what}.tif", np.full(SHAPE, i, np.uint16))
+    return folder
+
+
+def test_ranges_of_a_numbered_series_are_the_kinds_of_its_frames(series: Path) -> None:
+    with open_scan(series) as source:
+        assert (source.image_key == DARK).sum() == 6  # by their names
+    with open_scan(SourceOptions(series, frames="darks=0:1,flats=1:3+9:10", angles=np.arange(6) * 0.5)) as source:
+        assert source.image_key.tolist() == [DARK, FLAT, FLAT, *[VIEW] * 6, FLAT]
+        assert source.read(slice(None))[:, 0, 0].tolist() == list(range(10))
+        assert source.quantity == "counts"
+        np.testing.assert_allclose(source.angles[3:9], np.arange(6) * 0.5)
+    with open_scan(SourceOptions(series, frames="darks=:1, flats=1:3, views=3:6")) as source:
+        assert source.image_key.tolist() == [DARK, FLAT, FLAT, VIEW, VIEW, VIEW, *[NONE] * 4]
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ("darks=0:11", "'darks=0:11' is none of"),
+        ("bright=0:1", "'bright=0:1' is none of darks, flats, views, none with frames of 0:10"),
+        ("darks=3:3", "'darks=3:3'"),
+        ("darks=0:2,flats=1:3", "names frame 1 twice"),
+        ("darks", "'darks'"),
+        ("", "''"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(series: Path, frames: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        open_scan(SourceOptions(series, frames=frames))
+
+
+def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
+    """Darks, flats and two halves of the views in files of their own, as Diamond and others write them."""
+    paths = []
+    for name, key, first in (("d", [2, 2], 0), ("f", [1, 1, 1], 2), ("a", [0, 0], 5), ("b", [0, 0, 0], 7)):
+        paths.append(tmp_path / f"{name}.nxs")
+        with h5py.File(paths[-1], "w") as file:
+            entry = file.create_group("entry")
+            entry["instrument/detector/data"] = np.arange(first, first + len(key), dtype=np.uint16)[
+                :, None, None
+            ] * np.ones(SHAPE, np.uint16)
+            entry["instrument/detector/image_key"] = key
+            entry["sample/rotation_angle"] = 10.0 * np.arange(first, first + len(key))
+            entry["sample/rotation_angle"].attrs["units"] = "deg"
+    with open_scan(SourceOptions(paths[0], then=tuple(paths[1:]))) as source:
+        assert source.path == paths[0]
+        assert source.image_key.tolist() == [2, 2, 1, 1, 1, *[0] * 5]
+        assert source.read(slice(None))[:, 1, 1].tolist() == list(range(10))
+        np.testing.assert_allclose(np.degrees(source.angles[5:]), 10.0 * np.arange(5, 10))
+        assert source.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
+    with pytest.raises(DataError, match=r"gone\.nxs is not there"):
+        open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
+    with pytest.raises(DataError, match="cannot be followed with --then"):
+        open_scan(SourceOptions(paths[0], then=(paths[1],)), follow=True)

@@ -1,0 +1,114 @@
+"""Views and references of another light, and views that have a scale each, are told of with what explains them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.storage.rules.light import BRIGHTER, WARN, views_scaled
+from tests.beamline.array_source import ArraySource
+
+ANGLES, SHAPE, LIGHT = np.linspace(0, np.pi, 45, endpoint=False), (24, 64), 3000.0
+
+
+def lines(radius: float) -> np.ndarray:
+    """Line integrals of a ball beside the axis, or of a wide disc."""
+    across, down = np.arange(SHAPE[1]) - 31.5, np.arange(SHAPE[0]) - 11.5
+    at = 3 * np.cos(ANGLES)[:, None, None]
+    height = down[:, None] ** 2 if radius < 32 else 0 * down[:, None]
+    return np.asarray(0.01 * np.sqrt(np.clip(radius**2 - (across - at) ** 2 - height, 0, None)))
+
+
+def counts(radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Darks, flats and views, with noise."""
+    rng, beam = np.random.default_rng(1), np.full((5, *SHAPE), LIGHT)
+    through = rng.poisson(0 * beam), rng.poisson(beam), rng.poisson(LIGHT * np.exp(-lines(radius)))
+    darks, flats, views = (each + 100.0 for each in through)
+    return darks, flats, views
+
+
+def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray) -> str:
+    """All sentences of a scan, or of its refusal."""
+    frames = np.concatenate([np.clip(np.round(each), 0, 65535).astype(np.uint16) for each in (darks, flats, views)])
+    keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
+    angles = np.concatenate([np.full(len(darks) + len(flats), np.nan), ANGLES])
+    sentences: list[str] = []
+    try:
+        prepare_projections(ArraySource(frames, keys, angles), Selection(axis_col=31.5), sentences.append)  # type: ignore[arg-type]
+    except DataError as error:
+        return f"refused: {error}"
+    return " ".join(sentences)
+
+
+@pytest.mark.parametrize("radius", [20.0, 60.0])
+def test_references_of_the_light_of_the_views_are_not_told_of(radius: float) -> None:
+    assert "flats" not in told(*counts(radius)).replace("weaker than its flats", "")
+
+
+@pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 10.0])
+def test_flats_that_were_multiplied(factor: float) -> None:
+    darks, flats, views = counts(20.0)
+    said = told(darks, 100 + (flats - 100) * factor, views)
+    assert said.startswith("refused: ")
+    assert f"{max(factor, 1 / factor):.3g} times as {'dark' if factor > 1 else 'bright'} as the flats" in said
+    assert "No exposure is stated" in said
+
+
+def test_sums_of_frames() -> None:
+    darks, flats, views = counts(20.0)
+    assert "sums of 4 frames" in told(4 * darks, flats + 3 * flats[::-1].mean(), views)
+
+
+@pytest.mark.parametrize("bits", [2, 4])
+@pytest.mark.parametrize("radius", [20.0, 60.0])
+def test_counts_shifted_by_bits(bits: int, radius: float) -> None:
+    darks, flats, views = counts(radius)
+    said = told(darks, flats, views * 2**bits)
+    assert said.startswith("refused: ")
+    assert f"counts of the views are multiples of {2**bits}" in said
+
+
+def test_an_offset_of_signed_numbers() -> None:
+    darks, flats, views = counts(20.0)
+    assert "They differ by 32768" in told(darks, flats, views + 32768)
+
+
+def test_multiplied_flats_of_a_sample_that_fills_the_field_have_another_noise() -> None:
+    darks, flats, views = counts(60.0)
+    assert "times the noise of the views" in told(darks, 100 + (flats - 100) * 10, views)
+
+
+@pytest.mark.parametrize("level", [1 - 0.9 * (1 - np.exp(-WARN)), np.exp(0.9 * BRIGHTER)])
+def test_a_beam_that_drifts_is_not_told_of(level: float) -> None:
+    darks, flats, views = counts(20.0)
+    rng = np.random.default_rng(2)
+    assert "as the flats" not in told(darks, flats, rng.poisson((views - 100) * level) + 100)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_views_that_were_scaled_each_by_itself(dtype: type) -> None:
+    _, _, views = counts(20.0)
+    low, high = views.min((1, 2), keepdims=True), views.max((1, 2), keepdims=True)
+    whole = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
+    scaled = ((views - low) / (high - low) * whole).round(5 if whole == 1 else 0).astype(dtype)
+    (finding,) = views_scaled(ArraySource(scaled, [0] * len(scaled), ANGLES))  # type: ignore[arg-type]
+    assert finding.severity == "error"
+    assert "scaled by itself" in finding.message
+    one_scale = (views / views.max() * whole).astype(dtype)
+    assert not list(views_scaled(ArraySource(one_scale, [0] * len(one_scale), ANGLES)))  # type: ignore[arg-type]
+
+
+def test_a_dead_and_a_hot_pixel_are_no_scale() -> None:
+    _, _, views = counts(20.0)
+    views[:, 2, 3], views[:, 5, 6] = 0, 65535
+    assert not list(views_scaled(ArraySource(views.astype(np.uint16), [0] * len(views), ANGLES)))  # type: ignore[arg-type]
+
+
+def test_whole_numbers_that_stand_for_transmission() -> None:
+    """A full scale of 16 bits for all light, as documented, is written and not saturated."""
+    full = np.full((1, *SHAPE), 65535.0)
+    said = told(0 * full, full, 65535 * np.exp(-lines(20.0)))
+    assert said == ""
