@@ -81,7 +81,7 @@ def test_cameras_need_darks(
 
 @pytest.mark.parametrize("where", [np.s_[:, :, 5:20], np.s_[:, 4:9, 5:20], np.s_[:5]])
 def test_too_much_light_is_no_mark(tmp_path: Path, rng: np.random.Generator, where: tuple[slice, ...]) -> None:
-    """Air that is saturated in flats and views, as whole columns, too: more of such flats is saturated than of views."""
+    """Air that is saturated in flats and views, as whole columns, too: more of such flats is than of views."""
     path = _scan(tmp_path / "s.nx", rng, "u2")
     with h5py.File(path, "r+") as file:
         frames = file["entry/instrument/detector/data"][()]
