@@ -236,16 +236,6 @@ def to_disk(handle: int) -> None:
             raise
 
 
-def folder_to_disk(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk; Windows has no such call. OSError if it did not take them."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            to_disk(handle)
-        finally:
-            os.close(handle)
-
-
 def bring_to_disk(path: Path) -> None:
     """Wait until a file, or every file in a folder, is on the disk. OSError if the disk did not take it."""
     for part in path.rglob("*") if path.is_dir() else (path,):
