@@ -217,7 +217,7 @@ def _for_method(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
-    options.target.require_room(plan.output, plan.scratch)
+    options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # these are there
     return prepared
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from beamline.core.errors import DataError
+from beamline.core.need import Need
 from beamline.core.text import size
 from beamline.projections.prepare import refuse_spilled
 from beamline.projections.prepared import PreparedProjections
@@ -32,8 +33,8 @@ from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 
 
-@dataclass(frozen=True)
-class ReconPlan:
+@dataclass(frozen=True, kw_only=True)
+class ReconPlan(Need):
     """How a reconstruction uses memory and disk.
 
     Attributes:
@@ -41,20 +42,12 @@ class ReconPlan:
         allowed: bytes of memory that may be used.
         slabs: in which the volume is made; none: at once.
         missing: those that a partial volume lacks; all without one.
-        output, scratch: bytes on the disk for the result, and beside it while it is made.
     """
 
     needs: ReconMemory
     allowed: int
     slabs: Sequence[Slab]
     missing: Sequence[Slab]
-    output: int
-    scratch: int
-
-    @property
-    def memory(self) -> int:
-        """Bytes that are used."""
-        return max(self.needs.slab(self.slabs[0].own.stop), self.needs.least) if self.slabs else self.needs.at_once
 
     @property
     def line_integrals(self) -> int:
@@ -165,4 +158,12 @@ def _plan(
     missing: Sequence[Slab] = (),
 ) -> ReconPlan:
     output, scratch = options.disk_needs(needs.volume, in_slabs=bool(slabs))
-    return ReconPlan(needs, allowed, slabs, missing, output, scratch)
+    return ReconPlan(
+        memory=max(needs.slab(slabs[0].own.stop), needs.least) if slabs else needs.at_once,
+        output=output,
+        scratch=scratch + needs.line_integrals * bool(slabs),
+        needs=needs,
+        allowed=allowed,
+        slabs=slabs,
+        missing=missing,
+    )

@@ -44,7 +44,7 @@ def prepare_within(
         prepare_projections(source, selection, warn)  # faults of the views come first: this says them
         raise
     plan, buffer = planned(source, options, needs), None
-    options.target.require_room(plan.output, plan.scratch + plan.line_integrals)
+    options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
         sentence = (
             f"All at once would take {size(needs.at_once)}, {size(plan.allowed)} of memory may be used: views and "
