@@ -110,14 +110,9 @@ def study(request: StudyRequest) -> None:
     settings = row_settings(context.command, methods, dict(request.values))
     source, selection = chosen(request.file, request.seed, request.values)
     folder = request.output or Path(f"{request.file.stem}_{request.which}")
+    light = light_asked(request.values["photons_per_count"], request.values["dose_in"])
     options = StudyOptions(
-        scan=ComparedScan(
-            source,
-            selection,
-            folder,
-            request.truth,
-            light_asked(request.values["photons_per_count"], request.values["dose_in"]),
-        ),
+        scan=ComparedScan(source, selection, folder, request.truth, light),
         study=STUDIES[request.which],
         methods=methods,
         settings=settings,
