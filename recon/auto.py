@@ -19,7 +19,7 @@ from recon.splatting.finish import Candidates
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
-from recon.trials import ROWS, part_of, predicts_best
+from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import Fbp
 from recon.voxels.held_out import TRIAL_ROWS
 from recon.voxels.methods.fista_tv import FistaTv
@@ -37,8 +37,8 @@ class Auto:
 
     The part is the sixteen rows where most matter is, of a cone those in its middle. One of eight views is held out,
     and the method that leaves least of these is taken. Where the middle of a cone holds little matter, or methods have
-    settings of their own, each is run on 32 rows, or on all of them at half the resolution. There is no trial with
-    fewer than 16 views: the last one takes these. docs/choosing.md has reasons.
+    settings of their own, each is run on 32 rows, or on all of them at half the resolution. Trials need at
+    least 16 views; with fewer the last candidate is used. docs/choosing.md has reasons.
 
     Attributes:
         candidates: the methods, the simplest and cheapest first.
@@ -92,14 +92,14 @@ class Auto:
                 named = zip(self.candidates, residuals, strict=True)
                 listed = "; ".join(f"{method.name} {each:.4g}" for method, each in named if each < math.inf)
                 rows = min(TRIAL_ROWS, problem.geometry.detector_shape[0])
-                return int(np.argmin(residuals)), f"residual of views held out, {rows} rows: {listed}", True
+                return int(np.argmin(residuals)), f"trials on {rows} rows, {LEFT}: {listed}", True
         part, where = part_of(problem)
         if part is None:
             return last, where, False
         at, because = predicts_best(part, self.candidates, control)
         if at is None:
             return last, because, False
-        return at, f"residual of views held out, {where}: {because}", True
+        return at, f"trials on {where}, {LEFT}: {because}", True
 
     @property
     def _fit(self) -> FitMethod | None:

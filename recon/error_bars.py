@@ -84,7 +84,10 @@ def error_bars(
         known = ", ".join(with_trait("error_bars"))
         raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"error bars need {LEAST_VIEWS} views, in two halves; here are {geometry.n_views}")
+        raise ValueError(
+            f"error bars split the views into two halves: at least {LEAST_VIEWS} views are needed, "
+            f"got {geometry.n_views}"
+        )
     method = method_on_voxels(method, decided)
     factors = method.traits.error_bars
     assert factors is not None

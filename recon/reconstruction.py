@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
@@ -58,8 +59,9 @@ def reconstruct(
         these views.
 
     Warns:
-        UserWarning: angles look like degrees, projections like counts or transmission, or, for a method that keeps no
-            voxel below 0, like line integrals of the other sign. The reconstruction goes on.
+        UserWarning: projections are not finite where weights do not leave them out. Angles look like degrees,
+            projections like counts or transmission, or, for a method that keeps no voxel below 0, like line integrals
+            of the other sign. The reconstruction goes on.
     """
     check_arguments(reconstruct, locals())
     chosen = by_name(method)() if isinstance(method, str) else method
@@ -75,6 +77,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         if use.emission is None:
             warn_of_other_quantity(data)
+        _warn_of_unknown(data, use.weights)
     if isinstance(chosen, SignedMethod) and not chosen.allow_negative:
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
@@ -83,6 +86,21 @@ def reconstruct(
     settings = MappingProxyType(dict(result.settings))
     seconds = result.seconds or control.now() - begin
     return replace(result, settings=settings, method=result.method or chosen.name, seconds=seconds)
+
+
+def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
+    """Of values that are not finite, but for those that weights leave out."""
+    lost = sum(
+        int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
+        for at, view in enumerate(data)
+        if not np.isfinite(view).all()
+    )
+    if lost:
+        warnings.warn(
+            f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
+            "and weigh nothing. Give DataUse(weights) of 0 there, where that is known",
+            stacklevel=3,
+        )
 
 
 def _warn_of_negative(data: NDArray[np.float32]) -> None:

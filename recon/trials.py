@@ -15,14 +15,15 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import ChoosingMethod, DataUse, Method, Progress, ReconProblem, Reconstruction, RunControl
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid
 from recon.splatting.finish import beyond_voxels
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.splat import voxelize
-from recon.voxels.held_out import LEAST_VIEWS, busiest_rows, middle_of_cone, residuals_by_view, slab_of, split_views
+from recon.voxels.held_out import LEAST_VIEWS, busiest_rows, middle_of_cone, slab_of, split_views, unseen_residuals
 from recon.voxels.iterative import prior_decisions
-from recon.voxels.projector import Projector
-from recon.voxels.sweeps import whitened
+from recon.voxels.projector import Projector, projection_lines
+
+LEFT = "root mean square left of views held out, in line integrals"
+"""What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
 
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
@@ -172,11 +173,13 @@ def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
 
 
 def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F64:
-    """`residuals_by_view` of a result, negative values at zero; a fit also shows what no voxel can."""
+    """`unseen_residuals` of a result, negative values at zero; a fit also shows what no voxel can."""
     grid = made.volume.grid
-    differences = problem.projections - Projector(problem.geometry, grid).forward(np.maximum(made.volume.data, 0))
+    projector, views = Projector(problem.geometry, grid), problem.projections
     if made.gaussians is not None and isinstance(method, FitMethod):
-        start = voxelize(made.gaussians, grid, truncation=method.fit.truncation).numpy()
-        beyond = beyond_voxels(made.gaussians, problem.geometry, Volume(start, grid), method.fit)
-        differences -= 0 if beyond is None else beyond
-    return residuals_by_view(whitened(differences, problem.use.weights), problem.projections, problem.geometry)
+        beyond = beyond_voxels(made.gaussians, problem.geometry, grid, method.fit)
+        views = views if beyond is None else views - beyond
+    model, weights = projector.forward(np.maximum(made.volume.data, 0)), problem.use.weights
+    model, views = (projection_lines(each) for each in (model, views))
+    rays = None if weights is None else projection_lines(weights)
+    return unseen_residuals(model, views, rays, projector.resolution)

@@ -13,10 +13,18 @@ PAGES = sorted(path for path in DOCS.rglob("*.md") if path.relative_to(DOCS).par
 ENTRANCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
-def test_every_page_but_the_single_decisions_is_in_the_navigation() -> None:
+def test_every_page_is_in_the_navigation() -> None:
     listed = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), flags=re.M)
     names = [path.relative_to(DOCS).as_posix() for path in PAGES]
-    assert sorted(listed) == [name for name in names if not re.match(r"decisions/\d", name)]
+    assert sorted(listed) == names
+
+
+@pytest.mark.parametrize("room", sorted((DOCS / "decisions").glob("*.md")), ids=lambda path: path.stem)
+def test_the_index_of_decisions_has_the_headings_of_each_room(room: Path) -> None:
+    index = (DOCS / "decisions" / "index.md").read_text(encoding="utf-8")
+    headings = re.findall(r"^## (.*)$", room.read_text(encoding="utf-8"), flags=re.M)
+    row = "; ".join(headings).replace("|", r"\|")
+    assert not headings or f"]({room.name}) | {row} |" in index
 
 
 def anchors(page: Path) -> set[str]:

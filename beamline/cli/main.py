@@ -202,6 +202,11 @@ def main(debug: bool) -> None:
 
     Results go to stdout, messages and progress to stderr.
     """
+    threads = os.environ.get("NUMBA_NUM_THREADS", "1").strip()
+    if not (threads.isdecimal() and int(threads) > 0):
+        raise click.UsageError(
+            f"NUMBA_NUM_THREADS={threads} in the environment; expected a number of threads, 1 or more."
+        )
 
 
 def run() -> NoReturn:

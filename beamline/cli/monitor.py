@@ -22,7 +22,7 @@ from drivers.base.clock import Clock, SystemClock
 if TYPE_CHECKING:
     from beamline.monitor.check import Check, Level
     from beamline.monitor.references import ReferenceLimits
-    from beamline.projections.replay import Judged, Kind, ScanVerdict
+    from beamline.projections.replay import FrameVerdict, Kind, ScanVerdict
     from beamline.projections.returned import ReturnedView
 
 
@@ -122,7 +122,7 @@ def _watched(
     from beamline.storage.rules.scan import scan_ended
 
     progress, follow = counting("monitor", sink, clock), clock if request.follow else None
-    frames: list[Judged] = []
+    frames: list[FrameVerdict] = []
     active: set[tuple[str, Level]] = set()
     stopping, opened = StopOnSignal("Stopping."), SourceOptions(request.file, **request.values)
     with opened.open(follow=request.follow) as source, stopping() as stopped:

@@ -99,8 +99,8 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
     and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
-    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs
-    keeps those that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
+    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. Finished
+    slabs of a large volume are kept, even after a kill, in OUTPUT.partial.h5; --resume goes on from there.
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """

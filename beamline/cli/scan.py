@@ -15,7 +15,7 @@ import click
 from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
 from beamline.cli.page_beside import PageBeside
 from beamline.cli.terminal import Terminal
-from beamline.core.errors import AlarmError, DataError
+from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
 from beamline.core.files import remove
 from beamline.core.stop import StopRequest, stop_signals
@@ -131,6 +131,7 @@ def scan(request: ScanRequest) -> None:
         assert config is not None
         for sentence in series.left_out if series else ():
             click.echo(f"Warning: {sentence}", err=True)
+        _ask_about(config, asked=not (request.dry or request.rehearse or series))
         if request.dry:
             _dry_run(config, request.output, series, json_sink, request.as_json)
             return
@@ -140,6 +141,21 @@ def scan(request: ScanRequest) -> None:
         click.echo("\n".join([_results(result), *rehearsed]))
     if faults := faults_of(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _ask_about(config: Config, *, asked: bool) -> None:
+    """Warn of values that no instrument has, and ask whoever sits at the terminal whether they are meant.
+
+    Raises:
+        ConfigError: they are not. Nothing has moved.
+    """
+    from beamline.scan.preflight import doubts
+
+    sentences = doubts(config)
+    for sentence in sentences:
+        click.echo(f"Warning: {sentence}", err=True)
+    if sentences and asked and sys.stdin.isatty() and not click.confirm("Scan all the same?", err=True):
+        raise ConfigError("The configuration was not confirmed. Nothing has moved.")
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:

@@ -6,12 +6,13 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from beamline.config.devices import DcamOrca
 from beamline.config.errors import explain
@@ -69,7 +70,7 @@ def load(
         raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
-    tree = override(tree, overrides, os.environ if environment is None else environment)
+    tree = override(tree, overrides, os.environ if environment is None else environment, takes_text)
     if not rehearse:
         return _validated(tree, str(path))
     simulation = tree.data.pop("simulation", None)
@@ -85,10 +86,33 @@ def load(
     return _validated(Tree(rehearsal(config, simulation), tree.origins), str(path))
 
 
+def takes_text(keys: Sequence[str]) -> bool:
+    """Whether a key of the configuration takes any text, and nothing else but null."""
+    types: set[Any] = {Config}
+    for key in keys:
+        models = [each for each in types if isinstance(each, type) and issubclass(each, BaseModel)]
+        types = {
+            member
+            for model in models
+            if key in model.model_fields
+            for member in _alternatives(model.model_fields[key].annotation)
+        }
+    return str in types and types <= {str, NoneType}
+
+
+def _alternatives(annotation: Any) -> list[Any]:
+    """The types of an annotation."""
+    if get_origin(annotation) is Annotated:
+        return _alternatives(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return [each for part in get_args(annotation) for each in _alternatives(part)]
+    return [annotation]
+
+
 def changed(config: Config, overrides: Iterable[str]) -> Config:
     """The configuration with other values, without its file and the environment. ConfigError as `load`."""
     name = "the configuration"
-    return _validated(override(read(resolved_yaml(config), name), overrides, {}), name)
+    return _validated(override(read(resolved_yaml(config), name), overrides, {}, takes_text), name)
 
 
 def at_energies(config: Config) -> tuple[Config, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +15,7 @@ from beamline.core.files import YAML_FAULTS
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
 _MOST_VALUES, _MOST_DIGITS = 100_000, 1000
+_NOTHING = ("", "null", "~")
 
 
 @dataclass(frozen=True)
@@ -106,10 +107,19 @@ def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]
         _walk(child, (*path, word), name, origins)
 
 
-def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str]) -> Tree:
+def override(
+    tree: Tree,
+    overrides: Iterable[str],
+    environment: Mapping[str, str],
+    is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
+) -> Tree:
     """The tree with BEAMLINE_SECTION__KEY variables and then `section.key=value` overrides put over it.
 
-    Values are YAML. A variable without a double underscore is ignored.
+    Values are YAML; those of text keys are the text as it stands, where it is not quoted as YAML. A variable without a
+    double underscore is ignored.
+
+    Args:
+        is_text: whether the key of this path takes text.
 
     Raises:
         ConfigError: an override without `=`, or with a value that is not YAML.
@@ -125,10 +135,23 @@ def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str
         changes.append((key.strip().split("."), value, f"--set {word}"))
     data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
-        _put(data, keys, _parsed(text, origin)[0])
+        _put(data, keys, _value(keys, text, origin, is_text))
         path = tuple(keys)
         origins = {known: where for known, where in origins.items() if known[: len(path)] != path} | {path: origin}
     return Tree(data, origins)
+
+
+def _value(keys: list[str], text: str, origin: str, is_text: Callable[[Sequence[str]], bool]) -> Any:
+    try:
+        value = _parsed(text, origin)[0]
+    except ConfigError:
+        if text.lstrip()[:1] in ("'", '"') or not is_text(keys):
+            raise
+        return text.strip()
+    quoted = isinstance(value, str) and text.strip()[:1] in ("'", '"') and text.strip()[-1:] == text.strip()[:1]
+    if quoted or value == text.strip() or text.strip() in _NOTHING or not is_text(keys):
+        return value
+    return text.strip()  # with what YAML takes for a comment, a folded line, a number or a group
 
 
 def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:

@@ -45,7 +45,7 @@ def create_part(run: Path) -> Path:
 
 
 def _numbered(run: Path) -> dict[int, Path]:
-    parts = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*")) if not leads_away(part)}
+    parts = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*")) if not is_link(part)}
     return {int(number): part for number, part in parts.items() if number.isdecimal()}
 
 
@@ -88,8 +88,8 @@ def kind_of_data(path: Path) -> str | None:
         return None
 
 
-def leads_away(path: Path) -> bool:
-    """Whether a path is a link, or a junction of Windows, to another place."""
+def is_link(path: Path) -> bool:
+    """Whether the path is a symbolic link, or a junction of Windows."""
     try:
         status = path.lstat()
     except OSError:
@@ -116,7 +116,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
     parts, place = PurePosixPath(name).parts, folder
     for part in parts:
         place /= part
-        if part == ".." or PurePosixPath(part).is_absolute() or leads_away(place):
+        if part == ".." or PurePosixPath(part).is_absolute() or is_link(place):
             raise OSError(errno.ELOOP, "It is a link, and only what lies in the folder itself is read", str(place))
     place.stat()
     require_regular(place, largest)

@@ -8,10 +8,19 @@ from dataclasses import replace
 from queue import SimpleQueue
 from typing import Self, TextIO
 
-from beamline.core.events import Event, Sink, Warned
+from beamline.core.events import Event, Sink, StateEntered, Warned
 from drivers.base.clock import Clock
 
 Warn = Callable[[str], None]  # Takes a sentence about something that is wrong though work goes on
+
+
+class Note(str):
+    """A sentence about what was done: nothing is wrong. Who takes warnings tells it as a state."""
+
+
+def event_of_sentence(text: str, now: float) -> Event:
+    """A warning; of a note a state."""
+    return StateEntered("note", text, time=now) if isinstance(text, Note) else Warned(text, time=now)
 
 
 class JsonLines:
@@ -56,7 +65,7 @@ def while_it_works(sink: Sink, others: Sink) -> Sink:
 
 
 class Warnings:
-    """Sends each warning on as an event, once, and keeps it in `messages` for the report."""
+    """Sends each warning or note on as an event, once, and keeps it in `messages` for the report."""
 
     def __init__(self, sink: Sink, clock: Clock) -> None:
         self._sink, self._clock = sink, clock
@@ -65,7 +74,7 @@ class Warnings:
     def __call__(self, text: str) -> None:
         if text not in self.messages:
             self.messages.append(text)
-            self._sink(Warned(text, time=self._clock.now()))
+            self._sink(event_of_sentence(text, self._clock.now()))
 
 
 _PATIENCE = 10.0  # s

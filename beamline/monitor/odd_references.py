@@ -27,7 +27,7 @@ from beamline.monitor.references import (
     WORST,
     FaultKind,
     Group,
-    JudgedGroup,
+    GroupVerdict,
     ReferenceFault,
     ReferenceFrame,
     ReferenceLimits,
@@ -42,7 +42,7 @@ INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best f
 
 def without_odd(
     groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
-) -> tuple[list[list[ReferenceFrame]], list[JudgedGroup]]:
+) -> tuple[list[list[ReferenceFrame]], list[GroupVerdict]]:
     """The groups without the frames that cannot serve, without groups that become empty, and what these frames are.
 
     A group with no good frame at all stays whole where its kind has no other: `judge` tells its fault.
@@ -54,7 +54,7 @@ def without_odd(
     limits = limits or ReferenceLimits()
     blank, numbers = ([list(g) for g in groups if is_blank(g) is is_so] for is_so in (True, False))
     darks, flats = ([g for g in numbers if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
-    judged: list[JudgedGroup] = []
+    judged: list[GroupVerdict] = []
     darks = _split(darks, _unusable(darks, None, limits), judged)
     darks = _split(darks, _lit_darks(darks, flats), judged)
     flats = _split(flats, _unusable(flats, darks, limits), judged)
@@ -68,7 +68,7 @@ def without_odd(
 
 
 def _split(
-    groups: list[list[ReferenceFrame]], odd: list[OddFrame], judged: list[JudgedGroup]
+    groups: list[list[ReferenceFrame]], odd: list[OddFrame], judged: list[GroupVerdict]
 ) -> list[list[ReferenceFrame]]:
     """The groups without the odd frames, which are added to those judged; all of them, where none would be left."""
     rows = {each.frame.row for each in odd}
@@ -82,7 +82,7 @@ def _split(
                 scores = sorted(each.score for each in own)
                 figures = f"{scores[0]:.3g}" if scores[0] == scores[-1] else f"{scores[0]:.3g} to {scores[-1]:.3g}"
                 fault = ReferenceFault(kind, scores[-1], own[0].limit, own[0].sentence.format(figures=figures))
-                judged.append(JudgedGroup(group[0].kind, tuple(each.frame.row for each in own), (fault,)))
+                judged.append(GroupVerdict(group[0].kind, tuple(each.frame.row for each in own), (fault,)))
     return [group for group in good if group]
 
 

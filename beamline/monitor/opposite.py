@@ -42,9 +42,9 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A view for later."""
+    """A view that is kept until the one half a turn later arrives."""
 
-    view: CellView  # itself
+    view: CellView
     after: CellView | None = None  # the next one, which gives the velocity
     # turned, again: it was compared with the view from the other side, and with a repetition
     turned: bool = False

@@ -129,8 +129,8 @@ class ReferenceFault:
 
 
 @dataclass(frozen=True)
-class JudgedGroup:
-    """A group of references, taken together.
+class GroupVerdict:
+    """What the checks found of a group of references.
 
     Attributes:
         kind: DARK or FLAT.
@@ -154,7 +154,9 @@ class JudgedGroup:
 Group = Sequence[ReferenceFrame]
 
 
-def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()) -> tuple[JudgedGroup, ...]:
+def judge(
+    groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
+) -> tuple[GroupVerdict, ...]:
     """Judge groups of darks and flats, each by itself and beside the others.
 
     Args:
@@ -181,7 +183,7 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
             if not any(faults):
                 faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
         rows = tuple(reference.row for reference in group)
-        judged.append(JudgedGroup(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
+        judged.append(GroupVerdict(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
     return tuple(judged)
 
 

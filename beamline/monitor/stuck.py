@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import nan
 from typing import ClassVar
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
@@ -12,10 +13,18 @@ from drivers.base.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class StuckState:
-    """`checksum` of the frame before; `repeats`: how many frames in a row have had it."""
+    """Of the frame before.
+
+    Attributes:
+        checksum, angle: of it.
+        repeats: how many frames in a row have had this checksum.
+        noiseless: darks or flats of a single grey value repeat: a simulation without noise.
+    """
 
     checksum: int | None = None
+    angle: float = nan
     repeats: int = 0
+    noiseless: bool = False
 
 
 @dataclass(frozen=True)
@@ -31,10 +40,15 @@ class StuckCheck:
     start = StuckState
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
-        """Compare checksums. Darks and flats of a single grey value (simulated, without noise) are not compared."""
+        """Compare checksums. Without noise, references of a single grey value and the frames of a view are alike."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
-        if digest.checksum != state.checksum or plain:
-            return Look(replace(state, checksum=digest.checksum, repeats=0))
+        alike = digest.checksum == state.checksum
+        of_one_view = frame.kind is FrameKind.PROJECTION and frame.angle == state.angle
+        state = replace(
+            state, checksum=digest.checksum, angle=frame.angle, noiseless=state.noiseless or (plain and alike)
+        )
+        if not alike or plain or (state.noiseless and of_one_view):
+            return Look(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
             f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "

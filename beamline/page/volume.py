@@ -21,6 +21,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.base import VolumeScale
 from beamline.storage.volumes.files import opened_volume, times_of
 from beamline.storage.writers.recon_file import opened_reconstruction
+from recon.base.greys import apart, grey_windows
 
 F32 = NDArray[np.float32]
 HELD = 2**29
@@ -157,7 +158,6 @@ def _bytes_read(scale: VolumeScale, axis: int, first: list[int], end: list[int])
 
 
 BINS = 256
-_PERCENTILES = ((0.5, 99.8), (2, 98), (5, 95))
 
 
 @dataclass(frozen=True)
@@ -191,33 +191,6 @@ def _fbp_of(path: Path, record: ReconRecord) -> Any:
     if record.fbp is None:
         raise DataError(f"{path} keeps no FBP beside its volume.")
     return record.fbp
-
-
-def grey_windows(values: F32) -> dict[str, tuple[float, float]]:
-    """Ends of grey windows by their names, the first one first: matter, then percentiles of all values.
-
-    The first has the darkest and brightest percentiles, unless metal would leave all other matter black (its median
-    below a sixth of the window): the end is lowered until that median is at a third of it. Matter is what is above the
-    noise of air (5 times the rms of negative values) and above 2 % of the range, in volumes whose air is at 0 (within a
-    tenth of the range).
-    """
-    if values.size == 0:
-        return {"matter": (0.0, 1.0)}
-    levels = [float(level) for level in np.percentile(values, [each for ends in _PERCENTILES for each in ends])]
-    low, high = levels[:2]
-    negative = values[values < 0].astype(np.float64)
-    noise = math.sqrt(float(np.mean(negative**2))) if negative.size else 0.0
-    matter = values[values > max(5 * noise, 0.02 * high)]
-    middle = float(np.median(matter)) if matter.size and low < 0.1 * (high - low) else math.inf
-    windows = {"matter": _spread(low, 3 * middle if 6 * middle < high else high)}
-    for i, (first, last) in enumerate(_PERCENTILES):
-        windows[f"{first:g} to {last:g} %"] = _spread(*levels[2 * i : 2 * i + 2])
-    return windows
-
-
-def _spread(low: float, high: float) -> tuple[float, float]:
-    """These ends, apart also where all values are equal."""
-    return low, max(high, low + 1e-6 * max(abs(low), 1e-3))
 
 
 class ShownVolume:
@@ -260,7 +233,8 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, voxel along z, y, x and its unit, unit of values, method, views, windows of all times."""
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, views, angles of
+        the views that a sector lacks, windows of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
@@ -271,6 +245,8 @@ class ShownVolume:
             "length_unit": unit,
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
+            "because": str(self._parameters.get("chosen_because", "")),
+            "unseen_deg": np.asarray(self._parameters.get("unseen_deg", ()), np.float64).tolist(),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,
             "coarse_bin": self._slices[0].bin,
@@ -293,7 +269,7 @@ class ShownVolume:
         """Centres of 256 bins over the values, and voxels in each (of a sample, where there are many)."""
         sample = self._sample(time).astype(np.float64)  # in float32 a wide range overflows
         ends = (float(sample.min()), float(sample.max())) if sample.size else (0.0, 1.0)
-        counts, edges = np.histogram(sample, BINS, _spread(*ends))
+        counts, edges = np.histogram(sample, BINS, apart(*ends))
         return {"values": ((edges[1:] + edges[:-1]) / 2).tolist(), "voxels": counts.tolist()}
 
     def profile(self, axis: int, index: int, line: Sequence[float], time: int = 0) -> dict[str, list[float]]:

@@ -78,6 +78,12 @@ def golden(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.
     return start + span * np.mod(np.arange(views, dtype=np.float64) * GOLDEN, 1.0)
 
 
+def one_way(angles: NDArray[np.float64]) -> bool:
+    """Whether views [view] follow each other in one direction: until the last one they see a sector."""
+    steps = np.diff(angles)
+    return bool((steps > 0).all() or (steps < 0).all())
+
+
 def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
     """Degrees, one a line, in the order of acquisition; # starts a comment, empty lines count for nothing.
 

@@ -34,7 +34,7 @@ _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
-_FEW = 0.1  # of the views: so many are named, however far they are off
+_FEW = 0.2  # of the views: so many are named, however far they are off
 _AXES_AGREE = 0.75  # columns, as for a pair of opposite views
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
 _TURNED, _TURNED_SIGMAS = np.radians(5.0), 6.0  # of the error of angles along a scan
@@ -180,7 +180,8 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
         )
         return Law("mass of the views", float(abs(most)), limit, "of the mass", sentence)
     sentence = (
-        f"The mass of the views changes by {high - low:.0%}, {because}: {_way_of(shown.mass, frames)}. Did the energy "
+        f"The mass of the views changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%}, {because}: "
+        f"{_way_of(1 + shown.mass, frames)}. Did the energy "
         "or the sample change within the scan, or are views of another scan, exposure or reference among them? Choose "
         "views that belong together with --views; --time where the sample changes."
     )
@@ -197,10 +198,10 @@ def _way_of(mass: F64, frames: NDArray[np.int64]) -> str:
     steps = sums**2 * n / (before * (n - before))
     at = int(steps.argmax())
     if steps[at] > _STEP * whole:
-        return f"by {mass[at + 1 :].mean() - mass[: at + 1].mean():+.0%} from frame {frames[at + 1]} on"
+        return f"by {mass[at + 1 :].mean() / mass[: at + 1].mean() - 1:+.0%} from frame {frames[at + 1]} on"
     line = np.polyfit(np.arange(n), mass, 1)
     if line[0] ** 2 * ((np.arange(n) - (n - 1) / 2) ** 2).sum() > _EVEN * whole:
-        return f"evenly, by {line[0] * (n - 1):+.0%} from the first view to the last"
+        return f"evenly, by {line[0] * (n - 1) / line[1]:+.0%} from the first view to the last"
     return f"most in frame {frames[np.abs(away).argmax()]}"
 
 

@@ -324,8 +324,8 @@ class ScanCorrection:
             views = correction.transmission(data, frames.astype(np.float64), frames, progress)
         except ValueError as error:
             raise self._refusal(error) from error
-        if self._beam is not None and self._beam.current_factor is not None:
-            light = self._beam.current_factor[frames].astype(np.float32)[:, None, None]
+        if self._beam is not None and self._beam.light is not None:
+            light = self._beam.light[frames].astype(np.float32)[:, None, None]
             np.multiply(views.data, light, out=views.data)
             if views.beam is not None:
                 np.divide(views.beam, light, out=views.beam)

@@ -13,10 +13,10 @@ from beamline.projections.corrections.counts import Defects, noise_sentence, pho
 from beamline.projections.corrections.references import (
     Flats,
     ReferenceCheck,
-    current_scale,
     flats_sentence,
     read_references,
     use_current,
+    view_scale,
     warn_of_parts_without_flats,
     with_dynamic_flats,
 )
@@ -42,7 +42,8 @@ class OpenBeam:
         references: of the detector rows that are read, binned.
         settings: of the correction.
         photons: how pixels count photons; None: logarithms are taken.
-        current_factor: float64 [frame], by how much its light grows to the median ring current; None: not asked for.
+        light: float64 [frame], by how much that of a view grows to the usual exposure and, where it is asked for, the
+            median ring current; None: all views are alike.
         n_references: darks and flats that the file had.
         used: those that are used.
         done: results of its steps, by name of the step.
@@ -51,7 +52,7 @@ class OpenBeam:
     references: References
     settings: CorrectionSettings
     photons: Photons | None
-    current_factor: NDArray[np.float64] | None
+    light: NDArray[np.float64] | None
     n_references: int
     used: ReferenceGroups
     done: dict[str, StepDone]
@@ -69,7 +70,7 @@ class OpenBeam:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
             DataError: references that cannot be used.
         """
-        factor = current_scale(source) if use_current(selection) else None
+        light = view_scale(source, use_current(selection))
         n, accepted = count_references(source), selection.step(ReferenceCheck).accepted
         used = groups_taken(source) if accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
@@ -86,7 +87,7 @@ class OpenBeam:
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_sentence(source, references, factor), noise_sentence(references, photons)
+        flats, noise = flats_sentence(source, references, use_current(selection)), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {
@@ -94,7 +95,7 @@ class OpenBeam:
             "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, factor, n, used, done)
+        return cls(references, settings, photons, light, n, used, done)
 
     def correction(self, rows: slice, shadow: Mask | None) -> Correction:
         """The correction of some of the rows read, binned.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 
 import numpy as np
@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
-from beamline.core.sinks import Warn
+from beamline.core.plausible import RANGES, doubt
+from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
+from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanStep
@@ -165,7 +167,7 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
     """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
     usable = checked_views(source, selection, warn)
-    pixel_size(source, selection)
+    _warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
     for step in geometry_steps(selection):
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
@@ -173,6 +175,17 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
     if poses is not None:
         require_stated(poses, source, selection, usable.frames[first])
     return usable, poses
+
+
+def _warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
+    """Of a size, an energy or a distance that no instrument has, as of a mistaken unit."""
+    size_mm = pixel_size(source, selection)
+    stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
+    for step in in_order(selection):  # options of the same names
+        stated += [(each.name, getattr(step, each.name)) for each in fields(step) if each.name in RANGES]  # type: ignore[arg-type]
+    for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
+        if sentence:
+            warn(sentence)
 
 
 def _chosen(
@@ -275,6 +288,8 @@ def assemble(
     report_defects(projections, warn)
     if sides := cut_sides(projections.data, geometry):
         warn(cut_sentence(sides))
+        if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
+            warn(change)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")
@@ -334,11 +349,12 @@ def report_defects(projections: Projections, warn: Warn) -> None:
     unseen = areas(projections.masked)
     masked = float((projections.masked & ~unseen).mean())
     if unseen.mean() > 1e-3:
-        warn(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured.")
+        warn(Note(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured."))
     if masked > 1e-3:
-        warn(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours.")
+        warn(Note(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours."))
     if projections.replaced > 1e-3:
-        warn(f"{projections.replaced:.1%} of the pixels were zingers or not finite: filled from their neighbours.")
+        replaced = f"{projections.replaced:.1%} of the pixels were zingers or not finite"
+        warn(Note(f"{replaced}: filled from their neighbours."))
     if projections.floored > 1e-3:
         warn(
             f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from beamline.core.errors import DataError
-from beamline.core.sinks import Warn
+from beamline.core.sinks import Note, Warn
 from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.references import ReferenceCheck
@@ -41,7 +41,7 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     refuse(source, findings)
     usable = usable_views(source, flags.used, judged)
     if usable.sentence:
-        warn(usable.sentence)
+        warn(Note(usable.sentence))
     for finding in findings:
         if finding.severity == "warning":
             warn(finding.message)

@@ -36,8 +36,8 @@ POLL = 0.1  # s between looks at a growing file
 
 
 @dataclass(frozen=True)
-class Aside:
-    """Views with light so far, and those that checks left out.
+class SkippedChecks:
+    """Counts of views with light so far, and of those that checks skipped.
 
     Attributes:
         views: their number.
@@ -51,11 +51,11 @@ class Aside:
     cones: int = 0
     wider: int = 0
 
-    def with_frame(self, context: ScanContext) -> Aside:
+    def with_frame(self, context: ScanContext) -> SkippedChecks:
         """After the next frame; the checks knew `context` of it."""
         if context.view is None or context.grid is None:
             return self
-        return Aside(
+        return SkippedChecks(
             self.views + 1,
             self.alone + (context.change is None),
             self.without_flats + (not context.grid.flats),
@@ -76,8 +76,8 @@ class Aside:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What the checks said of a frame, and which frames there are so far.
+class FrameVerdict:
+    """What the checks found in a frame, and the state of the scan up to it.
 
     Attributes:
         row: of the frame, in the file.
@@ -93,7 +93,7 @@ class Judged:
     kind: FrameKind
     flags: tuple[Flag, ...]
     n: int
-    aside: Aside
+    aside: SkippedChecks
     drift: str = ""
     failures: tuple[str, ...] = ()
 
@@ -155,7 +155,7 @@ def replay(
     model: Callable[[float, int], NDArray[np.float32]] | None = None,
     follow: Clock | None = None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> Iterator[Judged]:
+) -> Iterator[FrameVerdict]:
     """Look at every frame, in the order of the file.
 
     Frames of line integrals are judged as the counts of a beam without noise; exposures that are not known count as
@@ -169,12 +169,12 @@ def replay(
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
+    monitor, aside = start(replace(context_of(source), model=model), checks), SkippedChecks()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags, failures = look_past_failures(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
+        yield FrameVerdict(frame.index, frame.kind, flags, n, aside, monitor.drift(), failures)
 
 
 def frames_of(
@@ -207,7 +207,7 @@ def frames_of(
         follow.sleep(POLL)
 
 
-def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> ScanVerdict:
+def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: ReferenceLimits | None = None) -> ScanVerdict:
     """What the checks said of the frames, together with what is wrong with darks, flats and the file.
 
     Args:

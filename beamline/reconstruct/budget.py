@@ -22,7 +22,7 @@ from recon.base.work import Rates
 from recon.methods import with_settings
 from recon.splatting.initialise import default_count, leaves_the_field
 from recon.splatting.work import speeds_of
-from recon.trials import ROWS, part_of, predicts_best
+from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
 _RESERVE = 0.02  # share of the budget for unmeasured work
@@ -187,7 +187,7 @@ def _chosen(
     at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
     if at is None:
         return plan.preferred(plan.choices()), f"{expected}too little time"
-    return plan.choices(name=liked[at].method)[0], f"residual of views held out, {where}: {residuals}"
+    return plan.choices(name=liked[at].method)[0], f"trials on {where}, {LEFT}: {residuals}"
 
 
 def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:

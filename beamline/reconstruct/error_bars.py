@@ -45,7 +45,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
     """Raise ConfigError before the work where these views allow no error bars."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
-            f"--uncertainty parts the views into two halves and needs {LEAST_VIEWS} at least; here are "
+            f"--uncertainty splits the views into two halves: at least {LEAST_VIEWS} views are needed, got "
             f"{geometry.n_views}. Leave it out, or take more views."
         )
     if isinstance(method, FitMethod) and method.finish_sweeps == 0:

@@ -48,9 +48,11 @@ from recon.splatting.last_round import LastRound
 from recon.warm_up import warm_up
 
 
-def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> Callable[[Progress], None]:
+def progress_events(
+    sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
+) -> Callable[[Progress], None]:
     """A listener that passes progress on as events, with `per_s` (steps) and `eta_s`; None where they are not known.
-    `seconds`: time of the fit, if no number of steps is planned.
+    `seconds`: time of the fit, if no number of steps is planned. `waiting`: views that it has not learnt yet.
     """
     first: Progress | None = None
     step = 0
@@ -67,7 +69,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
             eta = seconds_left(made, progress.steps - first.step, spent)
         elif seconds is not None and not progress.unit:
             eta = max(0.0, seconds - spent)
-        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=eta, time=clock.now()))
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=eta, waiting=waiting(), time=clock.now()))
 
     return on_progress
 
@@ -92,7 +94,7 @@ def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> N
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What leads from a reconstruction to its user and back.
+    """Events, warnings, clock and stop requests of one reconstruction.
 
     Attributes:
         stop_scope: opens what asks for an early end, with the volume so far.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.events import Sink, StateEntered, Warned
+from beamline.core.events import Sink, StateEntered
+from beamline.core.sinks import Note, event_of_sentence
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
 from beamline.reconstruct.outcome import ReportContext
@@ -115,7 +116,7 @@ class VolumeLooks:
     def warn(self, sentence: str) -> None:
         """Tell of a warning that is not empty, and keep it."""
         if sentence:
-            self.sink(Warned(sentence, time=self.clock.now()))
+            self.sink(event_of_sentence(sentence, self.clock.now()))
             self.warnings.append(sentence)
 
     @property
@@ -235,7 +236,7 @@ class VolumeLooks:
         self.keeps_fbp = not in_parts and self.target.takes_a_second(self.made.volume.grid)
         if self.keeps_fbp:
             output = self.target.output.name
-            self.warn(f"FBP of the same views is kept beside the volume: `beamline view {output}` shows both.")
+            self.warn(Note(f"FBP of the same views is kept beside the volume: `beamline view {output}` shows both."))
             return
         self.warn(
             "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "

@@ -43,6 +43,7 @@ from recon.splatting.stream import StreamingFit
 
 BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
+_BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
 _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
@@ -66,6 +67,9 @@ class ScanFollower:
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []
         self._begin = clock.now()
+        self._uncorrected = 0  # views in the file that the fit has not got yet
+        self._said_behind = False
+        self._tell_progress = progress_events(sink, clock, waiting=lambda: self.waiting)
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
         self.snapshots = Snapshots(options, source, sink, clock, warn)
         self._slices = LiveSlices(self.views, self.snapshots, clock)
@@ -81,6 +85,11 @@ class ScanFollower:
         return self._cursor.n_corrected + (self._cursor.newest is not None)
 
     @property
+    def waiting(self) -> int:
+        """Views in the file that no step of the fit has learnt yet."""
+        return self._uncorrected + (0 if self._fit is None else self._fit.n_unlearnt)
+
+    @property
     def has_volume(self) -> bool:
         """Whether there is a model, with enough views for a volume after a stop."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
@@ -94,6 +103,7 @@ class ScanFollower:
         self._cursor = replace(self._cursor, frames=n, taken=self._cursor.taken if views.size else n)
         if views.size:
             self._step(views, ended)
+        self._uncorrected = int((views >= self._cursor.taken).sum())
         return grown
 
     def _step(self, views: NDArray[np.int64], ended: bool) -> None:
@@ -252,7 +262,20 @@ class ScanFollower:
         # A fit that begins anew counts from its own beginning; the history has one time, that of the snapshots.
         progress = replace(progress, seconds=self._clock.now() - self._begin)
         self._history.append(progress)
-        progress_events(self._sink, self._clock)(progress)
+        self._tell_progress(progress)
+        self._say_if_behind(progress)
+
+    def _say_if_behind(self, progress: Progress) -> None:
+        """Say once that the fit does not keep up with the views."""
+        if self._said_behind or progress.n_views <= BATCH_VIEWS or progress.step >= _BEHIND * progress.n_views:
+            return
+        self._said_behind = True
+        message = (
+            f"The fit does not keep up: {count(progress.step, 'step')} for {progress.n_views} views, "
+            f"{self.waiting} wait. FBP is shown where it predicts views better, and the last round takes the steps "
+            "that are missing"
+        )
+        self._sink(StateEntered("behind", message, time=self._clock.now()))
 
     def ask_whether_enough(self) -> None:
         """With a goal, report the gain by further views, and once that the views so far are enough."""

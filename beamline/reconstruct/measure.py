@@ -20,7 +20,8 @@ from recon.assess import metrics
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.volume import Grid, Volume
-from recon.voxels.projector import residual_norms
+from recon.voxels.projector import project
+from recon.voxels.resolution import Resolution, as_voxels_see
 
 _RESIDUAL_VIEWS = 16
 RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
@@ -192,6 +193,29 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
     return {name: float(value) for name, value in values.items()}
 
 
+def squares_left(
+    projected: NDArray[np.float32],
+    views: NDArray[np.float32],
+    resolution: Resolution,
+    measured: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """[view] squares of A x - p and of p, summed over the rays that were measured, p at the resolution of voxels.
+
+    The data residual is the root of the sum of the first over that of the second, for every command that states one.
+
+    Args:
+        projected: [view, row, col] line integrals of the volume by a `Projector` of this resolution.
+        views: those measured, where NaN does not count.
+        measured: [view, row, col]; None: all rays.
+    """
+    known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
+    own = np.where(known, views, np.float32(0))
+    seen = as_voxels_see(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
+    left = np.where(known, projected - seen, 0)
+    sums = [np.square(each, dtype=np.float64).sum(axis=(1, 2)) for each in (left, own)]
+    return sums[0], sums[1]
+
+
 def _views_compared(geometry: Geometry) -> NDArray[np.int64]:
     n = geometry.n_views
     return np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
@@ -217,9 +241,9 @@ def _residual(
             height = (part.middle_height, *volume.grid.centre[1:])
             grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
             lines = Volume(np.ascontiguousarray(volume.data[rows]), grid)
-        measured = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
-        residual, scale = residual_norms(lines, data[views, rows], part, measured)
-        squared, total = squared + residual**2, total + scale**2
+        measured = None if weights is None else np.asarray(weights[views, rows] > 0)
+        left, own = squares_left(project(lines, part), data[views, rows], Resolution.of(part, lines.grid), measured)
+        squared, total = squared + left.sum(), total + own.sum()
         progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
         raise ValueError("projections are all zero, so there is nothing to explain")

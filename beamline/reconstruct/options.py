@@ -59,7 +59,7 @@ class ReconOptions:
         filter: of the FBP that the volume is compared with.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
-        follow: reconstruct a scan while it runs, so; None: it has ended.
+        follow: settings for a scan that is still running; None for one that has ended.
         enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: whose workers reconstruct slabs, see `workers.cluster`; None: this process does.

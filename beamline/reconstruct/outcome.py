@@ -69,7 +69,6 @@ class ReportContext:
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         leaves: whether there is time for so many seconds before the report.
         stray: the map of mass where views show nothing [y, x]; None without any.
-        elapsed: seconds of the whole command until its report is drawn, 0 before.
     """
 
     facts: ScanFacts
@@ -84,7 +83,6 @@ class ReportContext:
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True
     stray: NDArray[np.float32] | None = None
-    elapsed: float = 0.0
     filter: Filter = "hann"
     psnr: Sequence[tuple[float, float]] = ()
 

@@ -131,7 +131,7 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
             refuse_whole(source, options, needs, plan.allowed)
     if plan.slabs and not geometry.is_straight:
         raise DataError(
-            f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
+            f"{source.path}: its views are rolled or tilted, and a volume in slabs needs slices aligned with rows. "
             "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
         )
 
@@ -202,8 +202,8 @@ def prepare_within(
     options.target.require_room(plan.output, plan.scratch)
     if plan.slabs:
         sentence = (
-            f"All at once would take {size(needs.at_once)}, {size(plan.allowed)} of memory may be used: views and "
-            f"volume lie on the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
+            f"All at once would take {size(needs.at_once)}, but {size(plan.allowed)} of memory may be used: working in "
+            f"slabs, with {size(needs.line_integrals + needs.volume)} of scratch files on the output's disk."
         )
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))

@@ -47,10 +47,7 @@ def compose(
         summary=_summary(made, prepared, truth, metrics, context),
         scan=context.facts.table,
         settings=settings,
-        metrics={
-            label_of(method): {**values, "elapsed": context.elapsed} if method == made.method else values
-            for method, values in metrics.items()
-        },
+        metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
@@ -86,7 +83,7 @@ def _summary(
             what = f"{len(seconds)} volumes in time, {seconds[0]:.4g} to {seconds[-1]:.4g} s, of"
     summary = (
         f"{what} {shape} voxels from {geometry.n_views} of "
-        f"{prepared.n_projections} views in {made.seconds:.1f} s ({context.elapsed:.1f} s of the whole command); "
+        f"{prepared.n_projections} views in {made.seconds:.1f} s; "
         f"{METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and made.method != BASELINE:
@@ -111,7 +108,7 @@ def _footnotes(
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982)."
         if made.series is None
         else "Data residual: what the volumes, in each view as it shows them, leave of all views. It falls with noise.",
-        "Time of the whole command: from its start to this page, with reading, correction and measuring.",
+        "Time of the whole command: from its start until volume and page are written, with reading and measuring.",
     ]
     if any("cnr" in values for values in metrics.values()):
         footnotes.append(
@@ -190,13 +187,8 @@ def _slices(prepared: PreparedProjections, truth: Volume | None, volumes: Mappin
         Picture(
             "Slices",
             "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
-            "viewers. All share one grey window (1st to 99.5th percentile).",
+            "viewers. All share one grey window, from air to the densest class of matter; rare metal is white.",
             figures.orthogonal_slices(shown, unit, kind),
-        ),
-        Picture(
-            "Slices, low contrast",
-            "The same slices, brighter: the 2nd to 90th percentile, for weak matter; fewer streaks are better.",
-            figures.orthogonal_slices(shown, unit, kind, (2.0, 90.0)),
         ),
         Picture(
             "Sharpest edge, and values",

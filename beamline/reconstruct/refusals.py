@@ -21,10 +21,13 @@ from recon.splatting.backend import backend_for
 
 
 def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
-    """Raise ConfigError and DataError for what shows before a frame is read.
+    """Check all that can be checked without reading a frame.
 
     Returns:
         The truth [z, y, x] that the volume is to be compared with; None without one.
+
+    Raises:
+        ConfigError, DataError: a check failed; nothing was written.
     """
     if options.follow is not None:
         _refuse_unfollowed(options)

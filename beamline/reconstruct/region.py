@@ -98,8 +98,8 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
         given.append("--poses along the axis, or with roll, tilt or vectors")
     if given:
         raise ConfigError(
-            f"--roi takes rows for slices, and by {' and '.join(given)} a row may show others. Give --rows instead of "
-            "--roi, or leave that out. Nothing was read."
+            f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Give --rows "
+            "instead of --roi, or leave that out. Nothing was read."
         )
     rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
     slices = (rows.stop - rows.start) // side
@@ -128,7 +128,8 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
     if not geometry.rows_show_slices:
         raise DataError(
-            "The views are shifted along the axis, rolled or tilted: --roi takes rows for slices. Give --rows."
+            "The views are shifted along the axis, rolled or tilted, but --roi needs slices aligned with rows. Give "
+            "--rows."
         )
     _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)

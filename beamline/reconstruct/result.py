@@ -78,22 +78,21 @@ def write_result(
     phases = context.phases
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
-    elapsed = clock.now() - context.started
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
-    context = replace(context, warnings=remarks, stray=judged.stray_map, elapsed=elapsed)
+    context = replace(context, warnings=remarks, stray=judged.stray_map)
     phases.enter("report")
     record, volumes = _record(judged, context, clock.now())
-    page: Path | None = None
+    page, timed = None, _nothing
     try:
         if target.report is not None:
             from beamline.reconstruct.recon_report import compose  # here: matplotlib takes a second
-            from beamline.report.html import write_report
+            from beamline.report.html import write_report, write_timed
 
             metrics, parameters = judged.metrics, record.parameters
             report = compose(made, prepared, truth, volumes, metrics, parameters, context, judged.unexplained)
             report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
-            page = target.report
+            page, timed = target.report, partial(write_timed, target.report, report, label_of(made.method))
         phases.enter("writing the volume")
         if partial_volume is not None:
             complete(partial_volume, record, target.output, replace=target.replace)
@@ -105,9 +104,14 @@ def write_result(
         raise
     phases.end()
     elapsed = clock.now() - context.started
+    timed(elapsed)
     record = _light(replace(record, elapsed=elapsed, times=phases.seconds), target)  # to replace it reads its voxels
     sink(VolumeDone(record, time=clock.now()))
     return record
+
+
+def _nothing(elapsed: float) -> None:
+    """There is no page that states the time."""
 
 
 def _record(judged: VolumeLooks, context: ReportContext, now: float) -> tuple[ReconRecord, dict[str, Volume]]:
@@ -178,7 +182,7 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
 
 
 def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
-    """The record without what its files hold, or, where none is written, with no more than its volumes."""
+    """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:
         at = None if target.names or series is None else 0

@@ -24,7 +24,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from recon.base.decisions import Decisions
-from recon.base.method import Ending, Method, Progress, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Ending, Method, Progress, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.methods.fista_tv import FistaTv
@@ -295,7 +295,7 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
 
     def watch(progress: Progress) -> None:
         nonlocal reached
-        share = progress.step / progress.steps if progress.steps else 0.0
+        share = 0.0 if progress.unit == SWEEPS_OF_TRIALS or not progress.steps else progress.step / progress.steps
         at = done + round((slab.own.stop - slab.own.start) * share)
         reached = max(reached, at)  # a fit's finish counts from the beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -17,20 +17,24 @@ from beamline.core.errors import DataError
 from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
+from beamline.plan.angles import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, new_figure, png, round_length
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
+from recon.base.greys import matter_window
 from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
 from recon.prep.correct import Projections
+from recon.splatting.shown import ShownVolume
 from recon.splatting.stream import StreamingFit
+from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
 
 if TYPE_CHECKING:
@@ -42,7 +46,7 @@ class Snapshots:
     """The files `<output>.snapshot.h5` and `<output>.live.png` of a followed scan."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
-        self._source, self._sink, self._clock, self._warn = source, sink, clock, warn
+        self._options, self._source, self._sink, self._clock, self._warn = options, source, sink, clock, warn
         self._begin = clock.now()
         self._sample = str(source.attributes.get("sample", "not stated"))
         output = options.target.output
@@ -52,22 +56,31 @@ class Snapshots:
         self._slices: tuple[PictureRow, ...] = ()  # of the picture, as drawn last: by FBP, and of the volume
         self._grown: tuple[PictureRow, ...] = ()
         self._at: Sequence[float] | None = None  # z, y and x of the slices by FBP
+        self._unseen: Wedge | None = None  # of the views of these slices
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
         """The volume as it stands, and its picture, in place of the last ones."""
+        shown = fit.shown()
+        method, errors = self._method(shown)
         record = ReconRecord(
-            volume=fit.snapshot(),
+            volume=shown.volume,
             length_unit=self._unit,
             raw_file=str(self._source.path.resolve()),
             title=f"Snapshot from {fit.n_views} views",
             sample=self._sample,
             time=self._clock.now(),
-            parameters={"axis_col": axis_col, "n_views": fit.n_views},
+            parameters={
+                "axis_col": axis_col,
+                "n_views": fit.n_views,
+                "method": method,
+                "chosen_because": _why(errors),
+                "unseen_deg": np.degrees(self._unseen or ()),
+            },
         )
         try:
             write_reconstruction(self.path, record, replace=True)
-            self._grown = self._rows(fit, record.volume)
+            self._grown = self._rows(fit, record.volume, f"{method}, {_why(errors)}")
             self._write_picture()
         except DataError as error:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
@@ -75,12 +88,13 @@ class Snapshots:
             return
         now = self._clock.now()
         written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
-        self._sink(SnapshotWritten(*written, time=now))
+        self._sink(SnapshotWritten(*written, method, errors or None, time=now))
 
-    def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str) -> None:
+    def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str, unseen: Wedge | None) -> None:
         """The picture with these slices by FBP, above those of the volume when it was last drawn, if there is one."""
-        self._at = slices.at
-        self._slices = (PictureRow(heading, _slice_panels(slices.images, slices.at, slices.pixel, self._unit)),)
+        self._at, self._unseen = slices.at, unseen
+        panels = _slice_panels(slices.images, slices.at, slices.pixel, self._unit, unseen)
+        self._slices = (PictureRow(heading, panels),)
         try:
             self._write_picture()
         except DataError as error:
@@ -93,22 +107,38 @@ class Snapshots:
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 
-    def _rows(self, fit: StreamingFit, volume: Volume) -> tuple[PictureRow, ...]:
-        new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""
+    def _method(self, shown: ShownVolume) -> tuple[str, dict[str, float]]:
+        """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
+        fit, found = self._options.streaming.name, shown.errors
+        errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
+        return Fbp.name if shown.direct else fit, errors
+
+    def _rows(self, fit: StreamingFit, volume: Volume, shown: str) -> tuple[PictureRow, ...]:
         heading = (
-            f"{fit.n_views} views so far, {new}{fit.progress().n_gaussians} Gaussians, "
+            f"{fit.n_views} views so far by {shown}; {fit.progress().n_gaussians} Gaussians, "
             f"{self._clock.now() - self._begin:.0f} s after the first look"
         )
-        return volume_rows(volume, *fit.newest_view(), heading, self._unit, self._at)
+        return volume_rows(volume, *fit.newest_view(), heading, self._unit, (self._at, self._unseen))
 
     def _write_picture(self) -> None:
         write_whole(self.picture_path, live_picture((*self._slices, *self._grown)), replace=True)
         self.drawn = True
 
 
+def _why(errors: Mapping[str, float]) -> str:
+    """Why a method's volume is shown, for people."""
+    if not errors:
+        return "the only one so far"
+    each = ", ".join(f"{name} {error:.3f}" for name, error in errors.items())
+    return f"which predicts views held out better (error of the volume along them: {each})"
+
+
 _DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
 _SIGMAS = 5.0  # range of the differences
+_DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
+Wedge = tuple[float, float]
+"""First and last angle, in radians modulo π, of the views that are still missing; without a wedge None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,13 +151,11 @@ class PictureRow:
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
     """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
-    from matplotlib.figure import Figure
-
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
     headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
     width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
-    figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+    figure = new_figure((width / _DPI, height / _DPI), _DPI, False)
     top = height
     for row, pixels in zip(rows, tall, strict=True):
         if row.heading:
@@ -140,8 +168,9 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
 
 
 def volume_rows(
-    volume: Volume, view: F32, render: F32, heading: str, unit: str, place: Sequence[float] | None = None
-) -> tuple[PictureRow, PictureRow]:
+    volume: Volume, view: F32, render: F32, heading: str, unit: str,
+    drawn: tuple[Sequence[float] | None, Wedge | None] = (None, None),
+) -> tuple[PictureRow, PictureRow]:  # fmt: skip
     """Slices of a volume; the newest view, the same view of the volume, their difference.
 
     Args:
@@ -149,8 +178,9 @@ def volume_rows(
         view, render: the newest view [row, col] and the same view of the volume, line integrals.
         heading: of the whole, one line.
         unit: of length, "mm" or "px".
-        place: z, y and x of the slices; None: through what is bright.
+        drawn: z, y and x of the slices (None: through what is bright), and the wedge of angles without views.
     """
+    place, unseen = drawn
     grid, data = volume.grid, volume.data
     if place is None:
         k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
@@ -158,20 +188,22 @@ def volume_rows(
     else:
         z, y, x = (int(np.abs(axis - to).argmin()) for axis, to in zip(grid.coordinates(), place, strict=True))
     at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
-    panels = _slice_panels((data[z], data[:, y], data[:, :, x]), at, grid.voxel_size, unit)
+    panels = _slice_panels((data[z], data[:, y], data[:, :, x]), at, grid.voxel_size, unit, unseen)
     return PictureRow(heading, panels), PictureRow("", _view_panels(view, render))
 
 
-def _slice_panels(images: Sequence[F32], at: Sequence[float], pixel: float, unit: str) -> list[_Panel]:
+def _slice_panels(
+    images: Sequence[F32], at: Sequence[float], pixel: float, unit: str, unseen: Wedge | None = None
+) -> list[_Panel]:
     """Slices across z, y and x at these places, in the same greys."""
-    window = grey_window(images)
+    window = matter_window(*images)
     grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{unit}"
     labels = f"x → y ↓ at z = {at[0]:.3g} {unit}", f"x → z ↓ at y = {at[1]:.3g}", f"y → z ↓ at x = {at[2]:.3g}"
     notes = (grey, "the same greys and scale", "the same greys and scale")
     pixels, zoom = _sized(images)
     bar = pixel / zoom, unit
     return [
-        _Panel(image, "gray", window, label, note, None if k else bar)
+        _Panel(image, "gray", window, label, note, None if k else bar, None if k else unseen)
         for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
     ]
 
@@ -185,7 +217,7 @@ def _view_panels(view: F32, render: F32) -> list[_Panel]:
     (view, render, difference), _ = _sized((view, render, difference))
     return [
         _Panel(view, "gray", window, "newest view, u → z ↓", greys),
-        _Panel(render, "gray", window, "the volume seen from there", "the same greys"),
+        _Panel(render, "gray", window, "the fit seen from there", "the same greys"),
         _Panel(difference, _differences(), (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
     ]
 
@@ -206,6 +238,7 @@ class _Panel:
         colours, limits: colour map, and the values at its ends.
         label, note: the two lines.
         bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
+        unseen: for a dial of the rays in a slice across z that no view has taken yet; None: no dial.
     """
 
     pixels: F32
@@ -214,6 +247,7 @@ class _Panel:
     label: str
     note: str
     bar: tuple[float, str] | None = None
+    unseen: Wedge | None = None
 
     def draw(self, figure: Figure, left: int, top: int) -> None:
         """Draw it so many pixels from the left and the bottom of the figure, which is where its text begins."""
@@ -225,6 +259,23 @@ class _Panel:
         figure.figimage(self.pixels, left, bottom, cmap=self.colours, vmin=low, vmax=high, origin="upper")
         if self.bar is not None:
             self._scale(figure, left + 6, bottom + 6, *self.bar)
+        if self.unseen is not None:
+            self._dial(figure, left + self.pixels.shape[1] - 6, bottom + self.pixels.shape[0] - 6, self.unseen)
+
+    def _dial(self, figure: Figure, right: int, top: int, unseen: Wedge) -> None:
+        """Rays in a slice (y downwards) that no view has taken yet, as a double wedge: edges along them are unknown."""
+        from matplotlib.patches import Circle
+        from matplotlib.patches import Wedge as Sector
+
+        radius = _DIAL * min(self.pixels.shape)
+        centre = right - radius, top - radius
+        figure.add_artist(Circle(centre, radius, fill=False, ec="0.6", lw=1, transform=None))
+        first, last = (270 - math.degrees(angle) for angle in reversed(unseen))  # a ray of θ runs along -sin θ, cos θ
+        for half in (0, 180):
+            figure.add_artist(Sector(centre, radius, first + half, last + half, fc="tab:orange", transform=None))
+        width, height = figure.get_size_inches() * _DPI
+        place = (right - 2 * radius - 4) / width, (top - 12) / height
+        figure.text(*place, "rays to come", fontsize=8, color="tab:orange", ha="right")
 
     def _scale(self, figure: Figure, x: int, y: int, pixel: float, unit: str) -> None:
         """A bar of a round length, at most a third of the image."""
@@ -287,9 +338,9 @@ class LiveSlices:
             slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
             count = f"{n} of {of}" if of > n else str(n)
             place = "the middle, not known yet" if axis_col is None else f"column {col:.1f}"
-            coverage = _coverage(math.degrees(slices.covered), geometry.angles)
-            heading = f"FBP of {count} views so far{coverage}, axis at {place}"
-            self._snapshots.write_slices(slices, n, heading)
+            unseen = unseen_wedge(math.degrees(slices.covered), geometry.angles)
+            heading = f"FBP of {count} views so far{_coverage(unseen, geometry.angles)}, axis at {place}"
+            self._snapshots.write_slices(slices, n, heading, unseen)
         end = self._clock.now()
         self._newest, self._next = int(ids[-1]), end + max(pause or 0.0, end - begin)
 
@@ -303,10 +354,20 @@ class LiveSlices:
             self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
 
 
-def _coverage(degrees: float, angles: NDArray[np.float64]) -> str:
+def unseen_wedge(covered: float, angles: NDArray[np.float64]) -> Wedge | None:
+    """What views at these angles [view] leave out, where they cover a sector of so many degrees of the half turn."""
+    if covered > 180 - max(_WHOLE, 1.5 * covered / angles.size):
+        return None
+    theta = np.sort(np.mod(angles, np.pi))
+    gaps = np.diff(theta, append=theta[0] + np.pi)
+    widest = int(gaps.argmax())
+    middle, half = theta[widest] + gaps[widest] / 2, math.radians(180 - covered) / 2
+    return float(middle - half), float(middle + half)
+
+
+def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
     """What a heading says where the views leave a wedge out."""
-    if degrees > 180 - max(_WHOLE, 1.5 * degrees / angles.size):
+    if unseen is None:
         return ""
-    steps = np.diff(angles)
-    order = "sequential: " if (steps > 0).all() or (steps < 0).all() else ""
-    return f", {order}{degrees:.0f} of 180 degrees so far"
+    order = "sequential: " if one_way(angles) else ""
+    return f", {order}{180 - math.degrees(unseen[1] - unseen[0]):.0f} of 180 degrees so far"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.report.figures import DPI, WIDTH, GreyWindow, grey_window, png, show_grey
+from beamline.report.figures import WIDTH, GreyWindow, grey_window, new_figure, png, show_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,7 +41,6 @@ class FlaggedFrame:
 
 def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     """The frames as PNG, row 0 at the top, in one grey window, with a box around each region."""
-    from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
     down = -(-len(frames) // COLUMNS)
@@ -49,7 +48,7 @@ def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     rows, cols = frames[0].extent
     width = WIDTH / COLUMNS
     height = np.clip(width * rows / cols, 0.5, 3.0) + 0.25 + 0.13 * lines
-    figure = Figure(figsize=(WIDTH, float(height) * down), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, float(height) * down))
     window = grey_window([frame.image for frame in frames], 0.5, 99.5)
     panels = np.ravel(figure.subplots(down, COLUMNS, squeeze=False))
     for axes in panels[len(frames) :]:
@@ -74,12 +73,10 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
         images: [row, col] by title, counts or ratios, binned where they are large.
         shape: (rows, cols) of the detector.
     """
-    from matplotlib.figure import Figure
-
     rows, cols = shape
     width = WIDTH / max(len(images), 2)
     size = (width * len(images), float(np.clip(0.8 * width * rows / cols, 0.6, 4.0)) + 0.6)
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    figure = new_figure(size)
     for axes, (title, image) in zip(figure.subplots(1, len(images), squeeze=False)[0], images.items(), strict=True):
         shown = _show(axes, image, grey_window([image], 0.5, 99.5), shape)
         axes.tick_params(labelsize=6)

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from beamline.core.voxel_kind import VoxelKind
 from recon.base.geometry import Geometry
+from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.voxels.view_weights import Wedge
 
@@ -64,7 +65,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
     height = np.clip(0.82 * WIDTH * rows / cols, 1.6, 6.0)
-    figure, axes = _figure((WIDTH, height + 0.8))
+    figure, axes = one_panel(height + 0.8)
     edges = left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch
     image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=rows < _THIN * cols)
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
@@ -83,7 +84,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     order = np.argsort(geometry.angles, kind="stable")
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
-    figure, axes = _figure((WIDTH, 4.2))
+    figure, axes = one_panel(4.2)
     image = show_grey(axes, image_rows, grey_window([image_rows]), stretched=True)
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
@@ -101,6 +102,12 @@ def planes(grid: Grid) -> list[tuple[str, str, GreyWindow, GreyWindow]]:
     return [("x", "y", x, y[::-1]), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
 
 
+def slice_extent(grid: Grid) -> tuple[float, float, float, float]:
+    """Edges left, right, bottom and top of a slice [y, x], y downwards."""
+    _, _, across, down = planes(grid)[0]
+    return *across, *down
+
+
 def downwards(axis: str, unit: str) -> str:
     """Label of a vertical axis whose numbers grow downwards: the text is turned, so that its arrow points down."""
     return f"← {axis} ({unit})"
@@ -110,7 +117,6 @@ def orthogonal_slices(
     volumes: Mapping[str, Volume],
     unit: str,
     kind: VoxelKind = VoxelKind.ATTENUATION,
-    percentiles: GreyWindow = (1.0, 99.5),
 ) -> bytes:
     """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
 
@@ -120,26 +126,24 @@ def orthogonal_slices(
         volumes: by name, all on the same grid.
         unit: of length.
         kind: what the voxels are.
-        percentiles: of all the values shown, which become black and white.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     first = next(iter(volumes.values())).grid
     nz, ny, nx = first.shape
     at = bright_centre(list(volumes.values())[-1].data)
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
-    window = grey_window([image for images in slices.values() for image in images], *percentiles)
+    greys = matter_window(*(image for images in slices.values() for image in images))
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
     column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
-    figure = Figure(figsize=size, dpi=dpi_for(nx, column - 0.35), layout="constrained")
+    figure = new_figure(size, dpi_for(nx, column - 0.35))
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     for j, (name, images) in enumerate(slices.items()):
         for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
             axes = panels[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
-            shown = show_grey(axes, image, window, (*h_edges, *v_edges), stretched=thin)
+            shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
             axes.tick_params(labelsize=7)
             axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
@@ -159,22 +163,18 @@ def orthogonal_slices(
 
 def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """What each volume has more (red) or less (blue) than the first one, in the slice z of `orthogonal_slices`."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     (first, reference), *others = volumes.items()
     z = bright_centre(list(volumes.values())[-1].data)[0]
     images = [volume.data[z] - reference.data[z] for _, volume in others]
     reach = max(-grey_window(images)[0], grey_window(images)[1], 1e-12)
-    (_, cy, cx), (_, ny, nx), size = reference.grid.centre, reference.grid.shape, reference.grid.voxel_size
+    _, ny, nx = reference.grid.shape
     column = min((WIDTH - 1.2) / len(images), 5.4)
-    figure = Figure(
-        figsize=(1.2 + column * len(images), 0.9 + column * ny / nx), dpi=dpi_for(nx, column), layout="constrained"
-    )
+    figure = new_figure((1.2 + column * len(images), 0.9 + column * ny / nx), dpi_for(nx, column))
     for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
         shown = axes.imshow(
-            image, cmap="RdBu_r", extent=(*_edges(cx, nx, size), *_edges(cy, ny, size)[::-1]),
-            vmin=-reach, vmax=reach, interpolation="nearest",
+            image, cmap="RdBu_r", extent=slice_extent(reference.grid), vmin=-reach, vmax=reach, interpolation="nearest",
         )  # fmt: skip
         axes.tick_params(labelsize=7)
         axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
@@ -190,7 +190,6 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
     voxel. So single noisy voxels are no edges.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator, NullFormatter
 
     last = list(volumes.values())[-1].data
@@ -200,7 +199,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
     angle = math.atan2(down[y, x], across[y, x])
     t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
-    figure = Figure(figsize=(WIDTH, 3.2), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, 3.2))
     left, right = figure.subplots(1, 2)
     for name, volume in volumes.items():
         at = (y + t * math.sin(angle), x + t * math.cos(angle))
@@ -224,23 +223,23 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
 
 def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> bytes:
     """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
-    figure, axes = _figure((6.4, 5.4))
-    (y, x), (_, cy, cx) = image.shape, grid.centre
-    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
-    shown = axes.imshow(image, cmap="RdBu_r", extent=extent, vmin=-8, vmax=8, interpolation="nearest")
-    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
-    figure.colorbar(shown, ax=axes, label="standard deviations of the noise", pad=0.02)
-    return png(figure)
+    return _map(image, grid, unit, f"Slice {at}", "standard deviations of the noise", "RdBu_r", 8.0)
 
 
 def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
-    figure, axes = _figure((6.4, 5.4))
-    (y, x), (_, cy, cx) = image.shape, grid.centre
-    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
-    shown = axes.imshow(image, cmap="magma", extent=extent, interpolation="nearest")
-    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title="Highest density where views show nothing")
-    figure.colorbar(shown, ax=axes, label=kind.label(unit), pad=0.02)
+    return _map(image, grid, unit, "Highest density where views show nothing", kind.label(unit), "magma")
+
+
+def _map(
+    image: NDArray[np.float32], grid: Grid, unit: str, title: str, label: str, colours: str, reach: float | None = None
+) -> bytes:
+    """An image [y, x] of a slice of the grid, with a bar of its colours, which end at ±`reach`, or its values."""
+    figure, axes = one_panel(5.4, 6.4)
+    low = None if reach is None else -reach
+    shown = axes.imshow(image, colours, vmin=low, vmax=reach, extent=slice_extent(grid), interpolation="nearest")
+    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=title)
+    figure.colorbar(shown, ax=axes, label=label, pad=0.02)
     return png(figure)
 
 
@@ -249,9 +248,8 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     from matplotlib.patches import Wedge as Sector
 
     at, grid = bright_centre(volume.data)[0], volume.grid
-    figure, axes = _figure((6.4, 5.4))
-    edges = planes(grid)[0][2:]
-    show_grey(axes, volume.data[at], grey_window([volume.data[at]]), (*edges[0], *edges[1]))
+    figure, axes = one_panel(5.4, 6.4)
+    show_grey(axes, volume.data[at], matter_window(volume.data[at]), slice_extent(grid))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
         first, last = wedge.rays
@@ -265,20 +263,15 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
 
 def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
-    from matplotlib.figure import Figure
-
     at = bright_centre(volume.data)[0]
     grid = volume.grid
-    figure = Figure(figsize=(WIDTH, 4.4), dpi=dpi_for(grid.shape[2], WIDTH / 2.4), layout="constrained")
-    extent = (
-        *_edges(grid.centre[2], grid.shape[2], grid.voxel_size),
-        *_edges(grid.centre[1], grid.shape[1], grid.voxel_size)[::-1],
-    )
+    figure = new_figure((WIDTH, 4.4), dpi_for(grid.shape[2], WIDTH / 2.4))
+    extent = slice_extent(grid)
     length = round_length(grid.shape[2] * grid.voxel_size / 5)
     panels = ((volume, kind.value, "gray"), (deviation, "standard deviation", "magma"))
     for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
         image = shown.data[at]
-        low, high = grey_window([image], 0.5, 99.5)
+        low, high = matter_window(image) if shown is volume else grey_window([image], 0.5, 99.5)
         drawn = axes.imshow(image, cmap=colours, extent=extent, vmin=low, vmax=high, interpolation="nearest")
         left, top = extent[0] + length / 4, extent[3] + length / 4
         axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")
@@ -296,7 +289,7 @@ def round_length(length: float) -> float:
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
-    figure, axes = _figure((WIDTH, 2.8))
+    figure, axes = one_panel(2.8)
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
     axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
@@ -310,11 +303,9 @@ def pose_curves(
     angles_deg: NDArray[np.float64], shifts: NDArray[np.float64], turns_deg: NDArray[np.float64], unit: str
 ) -> bytes:
     """Displacement (col, row) in `unit`, and roll and tilt in degrees, of the views [view, 2] against their angle."""
-    from matplotlib.figure import Figure
-
     curves = [(shifts, unit, ("along the columns", "along the rows")), (turns_deg, "degrees", ("roll", "tilt"))]
     shown = [curve for curve in curves if curve[0].any()]
-    figure = Figure(figsize=(WIDTH, 2.4 * len(shown)), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, 2.4 * len(shown)))
     order = np.argsort(angles_deg, kind="stable")
     for axes, (values, label, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
         for column, name in enumerate(names):
@@ -352,10 +343,16 @@ def dpi_for(voxels: int, inches: float) -> float:
     return float(np.clip(voxels / inches, DPI, _FINEST))
 
 
-def _figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
+def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = True) -> Figure:
+    """A figure of this width and height, inches; `constrained`: panels make room for their labels."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    return Figure(figsize=size, dpi=dpi, layout="constrained" if constrained else None)
+
+
+def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
+    """A figure of one panel, inches."""
+    figure = new_figure((width, height))
     return figure, figure.subplots()
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from dataclasses import replace as with_fields
 from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from beamline.core.errors import DataError
 from beamline.core.files import write_whole
 from beamline.core.shipped import version
 from beamline.report.metrics import METRICS, formatted
@@ -63,6 +66,16 @@ def write_report(path: Path, report: Report, *, replace: bool = False) -> None:
         DataError: if `path` exists and `replace` is not set.
     """
     write_whole(path, to_html(report), replace=replace)
+
+
+def write_timed(path: Path, report: Report, label: str, elapsed: float) -> None:
+    """Write the page of a report once more, with the seconds of the whole command in the column of a method.
+
+    These are known when all else is written. Where the disk takes no more, the page stays as it is.
+    """
+    timed = {**report.metrics, label: {**report.metrics[label], "elapsed": elapsed}}
+    with suppress(DataError):
+        write_report(path, with_fields(report, metrics=timed), replace=True)
 
 
 def to_html(report: Report) -> str:

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from beamline.report.figures import WIDTH, bright_centre, dpi_for, grey_window, png
+from beamline.report.figures import WIDTH, bright_centre, dpi_for, new_figure, png
 from recon.base.arrays import F32
+from recon.base.greys import matter_window
 
 _COLUMNS = 4
 
@@ -38,15 +39,13 @@ class SliceSheet:
 
     def png(self, labels: Sequence[str]) -> bytes:
         """These slices, four beside one another, in the grey window of the first."""
-        from matplotlib.figure import Figure
-
-        low, high = grey_window([self._shown[labels[0]]])
+        low, high = matter_window(self._shown[labels[0]])
         rows, cols = self._shown[labels[0]].shape
         head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
         # One image: a panel for each slice takes ten times as long to draw.
         sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
-        figure = Figure(figsize=size, dpi=dpi_for(sheet.shape[1], WIDTH))
+        figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         for i, label in enumerate(labels):

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from beamline.report.figures import DPI, WIDTH, png
+from beamline.report.figures import WIDTH, new_figure, png
 from beamline.report.record import residual_curve
 from recon.assess.time_model import NextDecibel, duration_text, record
 
@@ -37,7 +36,7 @@ def quality_against_time(
     curve = residual_curve(history)
     panels = 1 + (curve is not None) + bool(psnr) + bool(growing)
     down, across = (1, panels) if panels < 4 else (2, 2)
-    figure = Figure(figsize=(WIDTH, 3.1 * down), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, 3.1 * down))
     left, *others = np.ravel(figure.subplots(down, across))
     for name, label, colour in (
         ("loss", "loss", "tab:blue"),

@@ -14,7 +14,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.plan.angles import middle_of_exposure, retake_block, return_triggers
 from beamline.plan.plan import Block, Timeline
-from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, Exposures, Taken
+from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
 from beamline.scan.ledger import LedgerError
 from beamline.scan.references import REFERENCES
 from beamline.scan.states import State
@@ -29,11 +29,11 @@ DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 
 @dataclass(frozen=True)
-class TakenBlock:
+class RecordedBlock:
     """A block with its frames and missing triggers; `again`: it takes views again, whose loss is no failure."""
 
     block: Block
-    taken: Taken
+    taken: BlockTally
     again: bool = False
 
 
@@ -64,7 +64,7 @@ class Acquisition:
         self._exposures = Exposures(
             devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
         )
-        self._done: list[TakenBlock] = []
+        self._done: list[RecordedBlock] = []
         self.recovered = 0
         """Views that gave no frame at first, but when they were repeated."""
         self.unsafe = False
@@ -129,7 +129,7 @@ class Acquisition:
         for block in self._timeline.blocks:
             self._stop.refuse_abort()
             if not block.left:
-                self._done.append(TakenBlock(block, Taken()))
+                self._done.append(RecordedBlock(block, BlockTally()))
                 continue
             views = block.kind is FrameKind.PROJECTION and not self._stop.stopping
             if views and (refused := self._supervision.refusal()):
@@ -140,12 +140,12 @@ class Acquisition:
             if block.kind is FrameKind.ALIGNMENT:
                 yield from self._on_the_way_back(block)
                 continue
-            done = TakenBlock(block, Taken())
+            done = RecordedBlock(block, BlockTally())
             yield from self._block(done)
             if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
                 yield from self._again(block, done.taken)
 
-    def _block(self, done: TakenBlock) -> Iterator[Frame]:
+    def _block(self, done: RecordedBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
         self._done.append(done)
         what = block.kind.name.lower(), str(block.mode), block.left, self.n_frames
@@ -161,7 +161,7 @@ class Acquisition:
             self._devices.sample.back()
         self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
-    def _again(self, views: Block, taken: Taken) -> Iterator[Frame]:
+    def _again(self, views: Block, taken: BlockTally) -> Iterator[Frame]:
         """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
         which is then not missing. A repeated view without a frame is not a further failure."""
         retakes = self._supervision.retakes(tuple(taken.missing))
@@ -169,7 +169,7 @@ class Acquisition:
             return
         triggers = np.array([retake.trigger for retake in retakes], np.int64)
         beyond = middle_of_exposure(views)[triggers]
-        done = TakenBlock(retake_block(views, triggers), Taken(), again=True)
+        done = RecordedBlock(retake_block(views, triggers), BlockTally(), again=True)
         for frame in self._block(done):
             i = frame.trigger
             angle, row, trigger = frame.angle - float(beyond[i]), retakes[i].row, views.n + i
@@ -191,7 +191,7 @@ class Acquisition:
         """Views that are taken a second time, at the angles of the first ones. Nothing replaces anything."""
         views = self._timeline.views
         beyond = middle_of_exposure(views)[return_triggers(views, block.n)]
-        done = TakenBlock(block, Taken(), again=True)
+        done = RecordedBlock(block, BlockTally(), again=True)
         for frame in self._block(done):
             invalid = frame.kind is FrameKind.INVALID
             yield frame if invalid else replace(frame, angle=frame.angle - float(beyond[frame.trigger]))
@@ -363,7 +363,7 @@ def _in_words(error: BaseException) -> str:
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 
 
-def _astray(block: Block, taken: Taken) -> str:
+def _astray(block: Block, taken: BlockTally) -> str:
     """A sentence on frames exposed while the stage was not at its angle, and where it was."""
     where = [
         f"view {trigger} at {math.degrees(float(block.angles[trigger])):.4g}°: {math.degrees(places[-1][1]):.4f}°"
@@ -376,7 +376,7 @@ def _astray(block: Block, taken: Taken) -> str:
     )
 
 
-def _describe(done: TakenBlock) -> str:
+def _describe(done: RecordedBlock) -> str:
     """Sentences on missing, extra and doubtful frames of a block."""
     block, taken, noun = done.block, done.taken, done.block.kind.name.lower()
     text = ""

@@ -38,17 +38,17 @@ Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
     """The confirmation of the frames until the stage stood: by its motion, by their number, or none."""
-    steady, moved, counted = (booked(ledger, braking, frames, way) for way in (by_nothing, by_motion, by_number))
+    steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
     fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last
     if _matched(moved) - _matched(steady) >= MOST * due:
         return by_motion
     all_counted = fewest <= counted.last <= most and counted.unconfirmed == ledger.unconfirmed
-    return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else by_nothing
+    return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else unassigned
 
 
-def booked(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
-    """The ledger with all frames."""
+def assigned(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
+    """The ledger after all frames were assigned to triggers, placed in this way."""
     for i in range(len(frames)):
         entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
         ledger = ledger if entered is None else entered[0]
@@ -56,17 +56,18 @@ def booked(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], w
 
 
 def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Place the frame where a constant deceleration has taken the stage by its time."""
     train = ledger.train
     if ledger.last >= 0:
         last, phase, period = ledger.last, ledger.phase, ledger.period
     elif train.first is not None and start_known(train):
         last, phase, period = 0, train.first, train.period
     else:
-        return by_nothing(ledger, braking, frame)
+        return unassigned(ledger, braking, frame)
     seconds = 1 / (period * braking.deceleration)
     began = phase + (braking.stood - last) * period - seconds / 2
     if not -EARLY <= began - braking.told <= LATE:
-        return by_nothing(ledger, braking, frame)
+        return unassigned(ledger, braking, frame)
     if frame.time <= began:
         return frame
     braked = min(frame.time - began, seconds)
@@ -74,13 +75,15 @@ def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> Delive
 
 
 def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Place the frame by the number of exposures since the last steady one."""
     if frame.time < braking.told or ledger.last < 0:
-        return by_nothing(ledger, braking, frame)
+        return unassigned(ledger, braking, frame)
     exposures = ledger.unmatched + frame.framestamp - ledger.exposed
     return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
 
 
-def by_nothing(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+def unassigned(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
+    """Place no frame from the stop on: it belongs to no trigger."""
     return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
 
 

@@ -15,7 +15,7 @@ from beamline.core.events import Sink, Warned
 from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
-from beamline.scan.braking import Braking, booked, by_nothing, placing
+from beamline.scan.braking import Braking, assigned, placing, unassigned
 from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
@@ -41,7 +41,7 @@ NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 
 @dataclass
-class Taken:
+class BlockTally:
     """Frames and missing triggers of a block; filled in while the block is taken.
 
     Attributes:
@@ -102,7 +102,7 @@ class _Pass:
     @property
     def so_far(self) -> Ledger:
         """The settled ledger, as if no further frame came."""
-        return booked(self.ledger, self.braking, self._exposed, by_nothing)
+        return assigned(self.ledger, self.braking, self._exposed, unassigned)
 
     @property
     def last_due(self) -> float:
@@ -122,7 +122,7 @@ class _Pass:
         brakes = self.braking is not NOT_BRAKING
         if brakes and not last:
             return
-        way = placing(self.ledger, self.braking, self._exposed) if brakes else by_nothing
+        way = placing(self.ledger, self.braking, self._exposed) if brakes else unassigned
         while self.waiting:
             exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
             if (entered := enter(self.ledger, exposed, last)) is None:
@@ -163,7 +163,7 @@ class Exposures:
         self._clock, self._stop, self._sink = clock, stop, sink
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
-    def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
+    def take(self, block: Block, first_row: int, taken: BlockTally) -> Iterator[Frame]:
         """The block's frames, numbered from `first_row`; `taken` records what is missing.
 
         A stop that comes while they are taken ends them early. A block begun after the stop is taken whole.
@@ -205,7 +205,7 @@ class Exposures:
         self._stage.start_move(angle, limits.max_speed)
         return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration), until_stop)
 
-    def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
+    def _fly(self, block: Block, taken: BlockTally) -> Iterator[tuple[CameraFrame, int, float]]:
         ahead, i = passes(block), 0
         # It begins within a pass only after a pause.
         while (i := self._after_pause(i, block, taken)) < block.n and not self._stop.stopping:
@@ -218,7 +218,7 @@ class Exposures:
             rest = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
             i += yield from self._pass(block, taken, rest, i, (begin, flown.end))
 
-    def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
+    def _after_pause(self, i: int, block: Block, taken: BlockTally) -> int:
         """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a
         lost beam it is the first trigger that may lack beam; it and later ones are repeated."""
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
@@ -234,7 +234,7 @@ class Exposures:
         return first
 
     def _pass(
-        self, block: Block, taken: Taken, train: TriggerTrain, first: int, ends: tuple[float, float]
+        self, block: Block, taken: BlockTally, train: TriggerTrain, first: int, ends: tuple[float, float]
     ) -> Generator[tuple[CameraFrame, int, float], None, int]:
         """Fly once over a train whose first trigger within the block is `first`; the stage stands at the first of the
         ends. Returns how many of its triggers are done with: all, or those up to the last frame before a pause."""
@@ -326,7 +326,7 @@ class Exposures:
             counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
             flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
 
-    def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float, bool]]:
+    def _one_by_one(self, block: Block, taken: BlockTally) -> Iterator[tuple[CameraFrame, int, float, bool]]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats. With each
         frame its trigger, where the stage was, and whether that was its angle."""
         self._camera.arm(block.n)

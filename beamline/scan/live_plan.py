@@ -6,12 +6,17 @@ import math
 from dataclasses import dataclass
 
 from beamline.core.text import count, size
+from beamline.plan.angles import one_way
+from beamline.plan.plan import Mode, ScanPlan
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
 _A_RAY, _A_VOXEL = 40, 50
 _WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
 _FEWEST = 90  # views
 _SHARE = 0.5  # share of the free memory
+_PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
+_SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
+"""dB of the live volume after a quarter, half and three quarters: 90 views of particles (docs/notes/performance.md)."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,23 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
         if used >= min(n_views, _FEWEST) or shape[1] // binning < 32:
             return LivePlan(binning, every, volume + used * view)
         binning *= 2
+
+
+def better_order(plan: ScanPlan) -> tuple[str, ...]:
+    """A sentence on an order of views whose live volume is better before the end; none where the plan has such one."""
+    angles = plan.angles[:: plan.frames_per_view]
+    if not one_way(angles) or angles.size < _FEWEST:
+        return ()
+    if plan.mode is Mode.STEP:
+        other, expected = "{scheme: golden}", _GOLDEN
+    elif passes := next((n for n in _PASSES if angles.size % n == 0), 0):
+        other, expected = f"{{scheme: interlaced, passes: {passes}}}", _INTERLACED
+    else:
+        return ()
+    return (
+        "until the last view the live volume knows a sector: after a quarter, half and three quarters of a scan of "
+        f"particles it has {_SEQUENTIAL} dB, by scan.angles {other} {expected} dB, and in the end the same",
+    )
 
 
 def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:

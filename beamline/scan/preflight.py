@@ -18,6 +18,7 @@ from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.files import broken_link
 from beamline.core.machine import free_memory
+from beamline.core.plausible import doubt, doubt_span
 from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
@@ -29,7 +30,7 @@ from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import duration_text, work_out
-from beamline.scan.live_plan import live_need
+from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
@@ -107,6 +108,21 @@ class DryRun:
         }
 
 
+def doubts(config: Config) -> list[str]:
+    """Sentences on values of a configuration that no instrument has, as of a mistaken unit; empty: there is none."""
+    optics, scan = config.optics, config.scan
+    energies = (optics.energy_kev, scan.energy, *(scan.energies or ()))
+    exposures = (scan.exposure_s, scan.darks.exposure_s, scan.flats.exposure_s)
+    sentences = [
+        doubt("pixel_size_um", optics.pixel_size_um),
+        doubt("distance_mm", optics.distance_mm),
+        *(doubt("energy_kev", energy) for energy in energies),
+        *(doubt("exposure_s", exposure) for exposure in exposures),
+        doubt_span(getattr(scan.angles, "span_deg", None)),
+    ]
+    return [sentence for sentence in dict.fromkeys(sentences) if sentence]
+
+
 def dry_run(
     settings: Config,
     runs: Path | None = None,
@@ -166,7 +182,8 @@ def _worked(
     worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
     if not config.recon.live or method == AUTO or not streams(method):
         return worked
-    return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, plan.n_views, free_memory())))
+    need = live_need(camera.shape, plan.n_views, free_memory())
+    return replace(worked, remarks=(*worked.remarks, need, *better_order(plan)))
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:

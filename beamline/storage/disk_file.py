@@ -14,8 +14,7 @@ from weakref import WeakSet
 from zlib_ng import zlib_ng
 
 from beamline.core.files import to_disk
-from beamline.storage.superblock import Superblock
-from beamline.storage.torn import made_whole
+from beamline.storage.superblock import Superblock, made_whole
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
 _BLOCK = 2**24  # bytes that are read back at once

@@ -79,7 +79,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     try:
         import zarr
     except ImportError as error:
-        raise DataError(f"{path} is a Zarr, which takes its own library: to read it, pip install zarr.") from error
+        raise DataError(f"{path} is a Zarr store. Reading it needs the package zarr: pip install zarr") from error
     try:
         root: Any = zarr.open(store=_regular_files(path), mode="r")
         image = _image(root)

@@ -8,7 +8,9 @@ import math
 import os
 import re
 import stat
+import struct
 import sys
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -20,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, damaged, memory_limit_sentence, out_of_memory
-from beamline.core.files import leads_away, same_file
+from beamline.core.files import is_link, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
 from beamline.storage.structure import require_harmless
@@ -104,8 +106,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
     if missing:
         raise DataError(
-            f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
-            "original. Where its disk did not take them, `beamline recover` keeps its frames. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If the disk "
+            "was full, `beamline recover` rescues its frames. Nothing was read."
         )
     if being_written:
         raise DataError(
@@ -155,7 +157,7 @@ def opened_itself(path: Path) -> Iterator[None]:
         for number, file in _open_by_name().items() if os.name == "posix" else ():
             if number not in by_name and os.fsdecode(file.name) == str(path):
                 opened.append(os.fstat(file.get_vfd_handle()))
-        itself = stat.S_ISREG(here.st_mode) and not leads_away(path) and all(same_file(here, each) for each in opened)
+        itself = stat.S_ISREG(here.st_mode) and not is_link(path) and all(same_file(here, each) for each in opened)
     except (OSError, ValueError):  # it is gone, or was closed
         itself = False
     if not itself:
@@ -197,8 +199,12 @@ def is_hdf5(path: Path, follow: bool = False) -> bool:
     return False
 
 
-ALTERED = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, OverflowError, MemoryError)
-"""What h5py and numpy raise where a file is damaged, or holds other things than its names promise."""
+ALTERED = (
+    *(OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
+    *(EOFError, MemoryError, struct.error, zlib.error),
+)
+"""What libraries raise where a file is damaged, or holds other things than its names promise; none of ours is among
+them."""
 
 
 @contextmanager

@@ -25,7 +25,9 @@ def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
     if len(sides) != 3 or any(isinstance(n, bool) or not isinstance(n, int | np.integer) for n in sides):
         raise ValueError(f"its {what} is {_brief(said)}; expected three whole numbers")
     if not all(1 <= n < _LONGEST for n in sides) or math.prod(map(int, sides)) > _MOST:
-        raise ValueError(f"its {what} is {_brief(said)}; expected numbers from 1 on, of a volume that can be")
+        raise ValueError(
+            f"its {what} is {_brief(said)}; expected numbers from 1 to 2^31 - 1, and a volume of at most 2^60 bytes"
+        )
     z, y, x = map(int, sides)
     return z, y, x
 

@@ -18,8 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import to_disk
 from beamline.core.text import size
 from beamline.storage.disk_file import UnderHdf5
-from beamline.storage.superblock import SIZE, Superblock
-from beamline.storage.torn import made_whole
+from beamline.storage.superblock import SIZE, Superblock, made_whole
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 

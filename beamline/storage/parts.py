@@ -43,7 +43,7 @@ def views_in(file: h5py.File) -> frozenset[int]:
     differs from its checksum.
 
     Raises:
-        ValueError: a row is said to replace one after it.
+        ValueError: a row claims to replace a later one.
     """
     n = int(file[layout.COMMITTED][()])
     triggers, replaces, kinds = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES, layout.KIND))

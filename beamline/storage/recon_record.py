@@ -120,12 +120,12 @@ class ReconRecord:
 
     @property
     def unit(self) -> str:
-        """Of the voxels; empty for shares."""
+        """Unit of the voxels; empty for shares."""
         return self.kind.unit(self.length_unit)
 
     @property
     def method(self) -> str:
-        """Its name; of a choice, that of the method chosen. Empty in the file of another program."""
+        """Name of the method; with `auto`, of the one that it chose. Empty in a file of another program."""
         return str(self.parameters.get("method", ""))
 
     @property

@@ -306,14 +306,14 @@ def _cut(path: Path, file: h5py.File, committed: int, head: Superblock) -> int:
         state_words(file, ending)
     elif ending != ending_in(file):
         state_ending(file, ending)
+    for name in growing:  # after what takes room, which HDF5 would put where these were
+        if len(file[name]) != frames:
+            file[name].resize(frames, 0)
     times = file[layout.TIME][()]
     if layout.END_TIME in file and not file[layout.END_TIME][()] and np.isfinite(times).any():
         file[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
     if layout.FIELD_OF_VIEW in file:
         layout.state_field_of_view(file)
-    for name in growing:  # last, so that HDF5 puts nothing into the room that this leaves
-        if len(file[name]) != frames:
-            file[name].resize(frames, 0)
     file[layout.FINISHED][()] = 1
     return frames
 

@@ -1,4 +1,9 @@
-"""The first 48 bytes of an HDF5 file: whether it is being written, missing bytes, and the same bytes if closed.
+"""HDF5's own blocks: the first 48 bytes of a file, and blocks that a kill left half written.
+
+The head says whether the file is being written and how many bytes it has. A kill may end a write where two pages of the
+file system's memory meet. The block is then new up to there, and old after it. Each field is the new or the old one,
+and both are right. Only the checksum, at the block's end, is not. (Specification 3.0: object headers IV.A, extensible
+arrays VII.D.)
 
 Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
 signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,
@@ -15,6 +20,11 @@ _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
 _WRITTEN, _GROWS = 1, 4
 _WORD = 0xFFFFFFFF
+
+_PAGE = 4096  # bytes; larger pages end where some of these do
+_HEADER = b"OHDR\2"
+_OF_ITS_LENGTH = (b"EAHD\0", b"EAIB\0", b"EASB\0", b"EADB\0")  # HDF5 asks for as many bytes as these have
+_TIMES, _PHASES = 0x20, 0x10  # flags of an object header: it has these fields
 
 
 @dataclass(frozen=True)
@@ -41,12 +51,12 @@ class Superblock:
 
     @property
     def intact(self) -> bool:
-        """Whether its checksum is right."""
+        """Whether the checksum of the head is right."""
         return self.head[_CHECKSUM] == lookup3(self.head[: _CHECKSUM.start])
 
     @property
     def end(self) -> int:
-        """Bytes that the file has, as its head says."""
+        """Length of the file in bytes, as its head states it."""
         return int.from_bytes(self.head[_END], "little")
 
     def closed(self, end: int) -> Superblock:
@@ -66,12 +76,46 @@ class Superblock:
 
 
 def superblock(path: Path) -> Superblock | None:
-    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes."""
+    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes.
+
+    Of one of which only the first half was written, as before: its flags come first.
+    """
     with path.open("rb") as file:
         head = file.read(SIZE)
     if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:
         return None
-    return Superblock(head, path.stat().st_size)
+    tries = [head, *(head[:_FLAGS] + bytes([flags]) + head[_FLAGS + 1 :] for flags in (0, _WRITTEN | _GROWS))]
+    found = [Superblock(each, path.stat().st_size) for each in tries]
+    return next((each for each in found if each.intact), found[0])
+
+
+def made_whole(at: int, read: memoryview) -> tuple[int, bytes] | None:
+    """Give a torn block the checksum of what is in it: in `read`, the bytes from `at` on that HDF5 asked for.
+
+    Returns:
+        where in the file the checksum is, and the right one. None: no block across the end of a page begins at `at`,
+        or its checksum is right.
+    """
+    size = block_size(read)
+    if not 8 < size <= len(read) or at // _PAGE == (at + size - 1) // _PAGE:
+        return None
+    right = lookup3(bytes(read[: size - 4]))
+    if read[size - 4 : size] == right:
+        return None
+    read[size - 4 : size] = right
+    return at + size - 4, right
+
+
+def block_size(read: memoryview) -> int:
+    """Bytes of the block that begins here, with its checksum; 0 for anything else."""
+    kind = bytes(read[:5])
+    if kind in _OF_ITS_LENGTH:
+        return len(read)
+    if kind != _HEADER or len(read) < 34:
+        return 0
+    flags = read[5]
+    first, width = 6 + 16 * bool(flags & _TIMES) + 4 * bool(flags & _PHASES), 1 << (flags & 3)
+    return first + width + int.from_bytes(read[first : first + width], "little") + 4
 
 
 def lookup3(data: bytes) -> bytes:

@@ -15,41 +15,17 @@ from __future__ import annotations
 ONE_IN = 8
 """One of so many views is held out. Without views held out: -2 dB on a texture, whose weight follows the noise."""
 
-COARSE = 1.2
-"""Pixels a voxel, from which on voxels cannot explain the edges of views. Without: -10.0, -6.7 dB on two cones."""
-
-ALIKE = 0.03
-"""Of the least residual: within it the strongest prior is taken where voxels are coarse. Without: -0.5, -2.4 dB."""
-
-OF_MATTER = 0.1
-"""Of the largest line integrals: rays of a cone above it judge, by the median. Without: -0.6 dB on a teapot."""
-
 ENOUGH_MATTER = 0.5
 """Of the matter in the fullest rows, that the middle of a cone must hold. Without: air would judge; not measured."""
 
-AIR = 0.03
-"""Of the largest line integral: trials leave out columns below it. Without: a tooth takes 129 for 55 CPU s."""
-
-BESIDE_MATTER = 0.05
-"""Of the width of the matter: air on either side that they keep. Without: matter at the edge is cut; not measured."""
+SHARPENED = 0.75
+"""Of what voxels are blurrier than views, that the model makes up for. Without: -0.5, -0.9 dB of `pnp-dct` on bone and
+cement, +0.2, -0.3 of FISTA-TV; with all of it -0.2, 0.0 and -0.3, -0.3 (docs/numerics.md)."""
 
 # How short may a trial be?
 
-TRIAL_SWEEPS = 16
-"""Sweeps of total variation. Without, after 8, a weight twice as heavy seems best: -0.8 to -2.9 dB on a teapot."""
-
-TRIAL_STEPS = 15
-"""Steps with patches. Without, with all 35: level within 0.1 dB, and half as much CPU time again."""
-
 TRIAL_THRESHOLD = 1.6
 """Times the threshold of 35 steps, which so few steps prefer. Without: -1.0 dB on fibres with texture."""
-
-FIRST_SHARE = 0.25
-"""Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
-
-FAR_BEHIND = 3.0
-"""dB behind voxels: such a trial fit ends at the first look. Without: 0.7 CPU s more, of 3. Winners of ten scans were
-at most 2.0 dB behind, others 3.6 or more."""
 
 # How do patches work?
 
@@ -95,9 +71,6 @@ of a shell in a coarse cone lose 1.2 dB."""
 VOXELS_A_GAUSSIAN = 60
 """In the cylinder of the field. Without, with half and a quarter as many: -0.1, -0.5 dB (`assess.plans.CURVES`)."""
 
-LEAST_GAUSSIANS, MOST_GAUSSIANS = 2000, 200_000
-"""Bounds of that number. Without: small fields get too few, and large ones more than 400 steps place; not measured."""
-
 SPREAD = 0.6
 """Width of a first Gaussian over the distance to its neighbours. Without: level, and a tenth to a fifth more CPU time,
 since each covers more pixels."""
@@ -113,32 +86,16 @@ WILD_PIXEL = 10.0
 WILD_VIEWS = 0.1
 """Of the views, which may hold such pixels. It belongs to `WILD_PIXEL`."""
 
-AT_THE_EDGE = 0.95
-"""Of the largest distance from the axis: edges beyond it tell whether the sample leaves the field. Without: the nearer
-edge of a detector off the axis is taken for one; not measured."""
-
 EMPTY = 0.15
 """Of a mean value: edges below are empty, as the air of a walnut with 0.07. Without: no box is wider, see `WIDER`."""
 
 WIDER = 1.2
 """Width of a fit's box over the field, where the sample leaves it. Without: -1.2 dB on a region of interest."""
 
-COARSEST = 4.0
-"""Pixels a voxel of a fit's box, at most. Without: fits of coarser volumes start from blurred matter; not measured."""
-
-START_WEIGHT = 0.004
-"""Density units: total variation of a first volume by sweeps, for cones without FDK. Without: not measured."""
-
-START_SWEEPS = 10
-"""Of these sweeps; with momentum, more fit the noise. Without: not measured."""
-
 # How is a fit made?
 
 DEFAULT_STEPS = 400
 """Of a fit before its finish. Without: a shell has 34.9 dB after 100, 41.3 after 400."""
-
-MODEL_STEPS = 50
-"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
 
 PACE = 26.0
 """Times the published rates, which are for 30 000 steps. Without: -1 to -4 dB after 1000 steps."""
@@ -167,9 +124,6 @@ TV_SHARE = 4
 """Sides of the box of total variation in the grid's: in a smaller one, places see it in rare kicks. Without, in the
 published one: -1.8 dB on a battery of 256³ voxels."""
 
-TV_WIDEST = 96
-"""Voxels of that side, at most. Without: a step in 512³ voxels takes longer; not measured."""
-
 APART = 0.75
 """Standard deviations of each half of a split from the centre. Without, by the published split: -12.9, -10.8 dB in
 streams of a shell and a teapot."""
@@ -183,9 +137,6 @@ GROWTH = 1.5
 at 400 steps."""
 
 # How is a fit refined?
-
-FINISH_SWEEPS = 8
-"""Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
 
 WILD_RAY = 0.5
 """Of the largest line integral: a ray that differs so much from the fit has no weight. Without: -8.4 dB on a teapot

@@ -143,6 +143,7 @@ class Geometry:
         """Cone beam from a point `sod` mm before the rotation axis onto a flat detector `sdd` mm behind the source.
 
         Args:
+            pixel_pitch: mm, in the plane of the detector; at the rotation axis a pixel is sod / sdd of it.
             where: `axis_col`, `axis_row`, `shifts`, `roll` and `tilt` by keyword, see `Where`.
 
         Raises:

@@ -56,6 +56,10 @@ class Progress:
     unit: str = ""
 
 
+SWEEPS_OF_TRIALS = "sweeps of trials"
+"""`Progress.unit` of trials, whose planned number is that of most scans: a search goes on as long as it must."""
+
+
 @dataclass(frozen=True, eq=False)
 class Energies:
     """The energies of views, and what pure materials attenuate there.

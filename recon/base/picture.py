@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import base64
-import struct
-import zlib
+import io
 from collections.abc import Mapping
 from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.greys import matter_window
+
 U8 = NDArray[np.uint8]
 _SIDE = 256  # pixels of a slice's longer side, at most
 _GAP = 4  # pixels between slices
-_SEEN = (0.5, 99.8)  # percentiles shown black and white
 
 
 def html(title: str, pixels: U8, facts: Mapping[str, str]) -> str:
@@ -28,14 +28,12 @@ def html(title: str, pixels: U8, facts: Mapping[str, str]) -> str:
 
 
 def png(pixels: U8) -> bytes:
-    """A grey picture [row, col] as PNG (ISO/IEC 15948): signature, header, rows that each begin with filter 0, end."""
-    height, width = pixels.shape
-    rows = np.concatenate((np.zeros((height, 1), np.uint8), pixels), axis=1)
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    )
+    """A grey picture [row, col] as PNG."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
 
 
 def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
@@ -48,15 +46,15 @@ def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
     parts = [np.asarray(part, np.float64) for part in slices]
     values = np.concatenate([part[np.isfinite(part)] for part in parts])
-    low, high = np.percentile(values, _SEEN) if values.size else (0.0, 0.0)
+    low, high = matter_window(values)
     sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
     left = 0
     for part in parts:
         with np.errstate(invalid="ignore"):
-            grey = 255 * np.clip((part - low) / (high - low if high > low else 1.0), 0, 1)
+            grey = 255 * np.clip((part - low) / (high - low), 0, 1)
         sheet[: len(part), left : left + part.shape[1]] = np.nan_to_num(grey).astype(np.uint8)
         left += part.shape[1] + _GAP
-    return sheet, (float(low), float(high))
+    return sheet, (low, high)
 
 
 def fan(angles: NDArray[np.float64], centre: float) -> U8:

@@ -47,7 +47,10 @@ class RayModel:
         if not self.exact_above >= 0:
             raise ValueError(f"exact_above must be a relative error >= 0 (inf: never), got {self.exact_above}")
         if not self.rectified and self.exact_above < math.inf:
-            raise ValueError("exact integrals are always rectified: leave exact_above at inf with rectified = False")
+            raise ValueError(
+                "rectified=False needs exact_above=inf, because exact integrals are always rectified; "
+                f"got {self.exact_above}"
+            )
 
     def length(self, geometry: Geometry) -> float:
         """mm used for the length of every ray in a Gaussian; 0 to use the true length.

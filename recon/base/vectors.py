@@ -151,8 +151,8 @@ def _require_pixels(u: F64, v: F64, frame: tuple[F64, F64, F64], size: float, sh
     view = int(np.argmax(off))
     if off[view] > TOLERANCE:
         raise ValueError(
-            f"view {view}: a corner of its detector lies {off[view]:.3g} pixels from that of square pixels of "
-            f"{size:.6g}, which all views share; expected at most {TOLERANCE}. Resample the views to such a detector"
+            f"view {view}: its detector pixels are not square, or not of {size:.6g} as in the other views: a corner is "
+            f"off by {off[view]:.3g} pixels, and {TOLERANCE} are allowed. Resample the views to one detector"
         )
 
 

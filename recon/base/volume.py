@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.declared_types import check_arguments, refusal
-from recon.base.empirical import COARSEST, WIDER
+from recon.base.empirical import WIDER
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
 from recon.base.settings_check import check_settings
+
+COARSEST = 4.0
+"""Pixels a voxel of a fit's box, at most. Without: fits of coarser volumes start from blurred matter; not measured."""
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ class _Mirrored:
         )  # fmt: skip
 
     def mismatch(self, rows: slice = _ALL, others: int = 0) -> Floats:
-        """The curve [candidate] of some rows; each of the first set with the row `others` before it in the second."""
+        """Mismatch [candidate] of row i of the first set with row i - `others` of the second, over some rows i."""
         (fa, fb), (sum_a, sum_b) = self.spectra, self.sums
         if others:
             fb, sum_b = np.roll(fb, others, axis=0), np.roll(sum_b, others, axis=0)

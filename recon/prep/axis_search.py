@@ -38,6 +38,10 @@ class AxisEstimate:
     confident: bool
     method: str
 
+    def __str__(self) -> str:
+        sure = "confident" if self.confident else "not confident"
+        return f"column {self.value:.2f} by {self.method}, {sure} ({len(self.candidates)} candidates)"
+
 
 def few_rows(data: NDArray[np.floating]) -> Floats:
     """At most 16 rows, each the mean of up to 4, which has less noise: the sum of slices is again a slice."""

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
+from recon.base.arrays import F32, F64
 from recon.base.masks import Image
 from recon.base.settings_check import check_settings
 from recon.prep.dynamic_flats import DynamicFlats
+
+Kept = TypeVar("Kept", F32, F64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +70,20 @@ def check(references: References) -> None:
     at = sorted(p for p, _ in references.flats)
     if len(set(at)) < len(at) or not np.isfinite(at).all():
         raise ValueError(f"each group of flats needs a position of its own, got {at}; average the flats taken together")
+
+
+def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
+    """The dark of an exposure, s: offset and dark current are linear in it, so that two darks tell that of any other.
+
+    Args:
+        darks: (exposure, image [row, col]), one or more, of different exposures.
+    """
+    near = sorted(darks, key=lambda dark: abs(dark[0] - exposure))
+    (first, image), *others = near
+    if not others or first == exposure:
+        return image
+    second, other = others[0]
+    return image + (exposure - first) / (second - first) * (other - image)
 
 
 def flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:

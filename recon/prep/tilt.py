@@ -67,9 +67,11 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
     if not np.isfinite(data).all():
         raise ValueError("bands hold NaN or infinite values; correct them first")
     if data.shape[2] < FEWEST_COLS:
-        raise ValueError(f"{data.shape[2]} columns show no axis; {FEWEST_COLS} are needed")
+        raise ValueError(f"{data.shape[2]} columns are too few to show the axis; at least {FEWEST_COLS} are needed")
     if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
-        raise ValueError(f"{len(heights)} bands of rows; {FEWEST_BANDS} at different heights are needed")
+        raise ValueError(
+            f"{len(heights)} bands of rows are too few; at least {FEWEST_BANDS} at different heights are needed"
+        )
     for curves_of in (wedge_curves, opposite_curves):
         with suppress(ValueError):
             return _line(*curves_of(data, np.asarray(angles, np.float64)), heights)

@@ -61,5 +61,5 @@ def average(state: FitState, since: int) -> None:
 
 
 def averaged(state: FitState) -> FitState:
-    """The state with the mean in place of its parameters, if a mean is kept; it shares their memory."""
+    """The state with its parameters replaced by their running mean, if it has one; nothing is copied."""
     return state if state.mean is None else replace(state, parameters=state.mean)

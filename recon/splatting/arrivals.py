@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.arrays import F32
 
 _NEWEST = 0.2  # this share of the views counts as the newest
+_ONE_IN = 16  # of so many views one is held out until the last round
 
 
 def checked(data: ArrayLike, angles: NDArray[np.float64], detector_shape: tuple[int, int]) -> F32:
@@ -35,6 +36,11 @@ def chosen(n_views: int, rng: np.random.Generator) -> int | None:
     if newest >= n_views or rng.random() >= 1 / 3:
         return None
     return int(rng.integers(n_views - newest, n_views))
+
+
+def held_out(view: int) -> bool:
+    """Whether the view of this number is not learnt before the last round: it judges the volumes so far."""
+    return view % _ONE_IN == _ONE_IN // 2
 
 
 def span(theta: NDArray[np.float64]) -> float:

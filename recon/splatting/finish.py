@@ -17,31 +17,33 @@ import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
-from recon.base.empirical import (
-    FAR_BEHIND,
-    FEW_WILD,
-    FINISH_SWEEPS,
-    FIRST_SHARE,
-    TRIAL_STEPS,
-    TRIAL_THRESHOLD,
-    WILD_RAY,
-)
+from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.noise import ring_offsets
-from recon.base.volume import Volume
+from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
-from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight, is_coarse
+from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import Patches, PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import pnp_dct
+from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
+
+FINISH_SWEEPS = 8
+"""Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
+
+FAR_BEHIND = 3.0
+"""dB behind voxels: such a trial fit ends at the first look. Without: 0.7 CPU s more, of 3. Winners of ten scans were
+at most 2.0 dB behind, others 3.6 or more."""
+
+FIRST_SHARE = 0.25
+"""Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
 
 SUBSETS, TV_STEPS = 9, 3
 
@@ -49,8 +51,8 @@ SUBSETS, TV_STEPS = 9, 3
 class _Watch:
     """Tells of sweeps, and asks whether to stop; `ended`: the last answer was yes."""
 
-    def __init__(self, control: RunControl, n_views: int) -> None:
-        self._control, self._n_views = control, n_views
+    def __init__(self, control: RunControl, n_views: int, trials: int) -> None:
+        self._control, self._n_views, self._of_trials = control, n_views, trials
         self._begin, self._trials, self.ended = control.now(), 0, False
 
     def asked(self) -> bool:
@@ -61,7 +63,7 @@ class _Watch:
         if self._control.stop_trials is not None and self._control.stop_trials():
             return True
         self._trials += 1
-        return self.sweep(self._trials, 0, "sweeps of trials")
+        return self.sweep(self._trials, max(self._trials, self._of_trials), SWEEPS_OF_TRIALS)
 
     def sweep(self, number: int, of: int, unit: str = "sweeps on voxels") -> bool:
         if self._control.on_progress is not None:
@@ -118,7 +120,7 @@ class _Planning:
         weight = choose_weight(problem, x, FINISH_SWEEPS, lambda: judge)
         if isinstance(weight, NoiseBalance):
             return x
-        patches, tried = _patches(problem, weight, lambda: judge), self.tried
+        patches, tried = choose_patches(problem, weight, lambda: judge), self.tried
         tried.direct = judge.residuals(judge.start) if judge.direct else None
         tried.smooth = judge.of_weight(weight)
         if patches.better:
@@ -138,7 +140,7 @@ class _Planning:
         part, wide = trial.problem, trial.wide.seen()
         seen, cols = wide.projector, trial.wide.cols
         weights = None if wide.weight is None else projection_images(wide.weight)
-        views = ReconProblem(projection_images(wide.data), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
+        views = ReconProblem(projection_images(wide.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -147,7 +149,7 @@ class _Planning:
         beyond, other = (
             None if views is None else np.ascontiguousarray(projection_lines(views)[:, cols])
             for views in (
-                beyond_voxels(fitted.gaussians, geometry, fitted.volume, self.settings)
+                beyond_voxels(fitted.gaussians, geometry, fitted.volume.grid, self.settings)
                 for geometry in (seen.geometry, trial.wide.unseen)
             )
         )
@@ -159,15 +161,8 @@ class _Planning:
         )
         residuals = trial.residuals(refined, other)
         taken = 0.0 if other is None else math.sqrt(np.mean(np.square(other, dtype=np.float64)))
-        self.apart = taken > residuals.mean() and not is_coarse(seen.geometry, seen.grid)
+        self.apart = taken > residuals.mean()
         return None if trial.ended else residuals
-
-
-def _patches(problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None]) -> Patches:
-    """`choose_patches`; none where voxels are coarse, and without a search: they are never better there."""
-    if is_coarse(problem.projector.geometry, problem.projector.grid):
-        return Patches(0.0, False)
-    return choose_patches(problem, weight, trial)
 
 
 def _middle_of(volume: F32, shape: tuple[int, int, int]) -> F32:
@@ -180,26 +175,23 @@ def _without(problem: VoxelProblem, beyond: F32 | None) -> VoxelProblem:
     return problem if beyond is None else replace(problem, data=problem.data - beyond)
 
 
-def beyond_voxels(gaussians: Gaussians, views: Geometry, volume: Volume, settings: FitSettings) -> F32 | None:
+def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
     """[view, row, col] what Gaussians explain of the views, and no voxels of their volume can; None: nothing.
 
     That is matter beyond the box: what Gaussians whose centres lie there add to the views, but not to the voxels.
     Measured views alone would bend the volume, by -12 dB on a region of interest and -22 dB in the end slices of a
-    thorax that goes on above the field. Where voxels are coarse also the edges within them (-6 dB on a teapot of 10⁵
-    photons): all that the voxels of the start explain otherwise than the Gaussians.
+    thorax that goes on above the field.
     """
-    grid = volume.grid
-    if not is_coarse(views, grid):
-        import torch
+    import torch
 
-        half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
-        outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
-        gaussians = gaussians.select(outside.any(dim=1))
-        if not gaussians.n:
-            return None
-        volume = Volume(voxelize(gaussians, grid, truncation=settings.truncation).numpy(), grid)
+    half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
+    outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
+    gaussians = gaussians.select(outside.any(dim=1))
+    if not gaussians.n:
+        return None
+    inside = voxelize(gaussians, grid, truncation=settings.truncation).numpy()
     model = project(gaussians, views, truncation=settings.truncation, model=settings.rays).numpy()
-    return model - Projector(views, grid).forward(np.maximum(volume.data, 0))
+    return model - Projector(views, grid).forward(np.maximum(inside, 0))
 
 
 def refine(
@@ -234,7 +226,8 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     data, weights = masked(problem.projections, problem.use.weights)
     if not data.any():
         return Candidates()
-    watch, decide = _Watch(control, problem.geometry.n_views), Decisions(problem.seed)
+    trials = PnpDct().trial_sweeps + round(FIRST_SHARE * DEFAULT_STEPS) + FINISH_SWEEPS + TRIAL_STEPS
+    watch, decide = _Watch(control, problem.geometry.n_views, trials), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
@@ -247,24 +240,18 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
 
 @dataclass
 class _Finish:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow.
-
-    `share`: of the prior that views held out choose.
-    """
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow."""
 
     iterations: int
     patches: bool
-    share: float
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
         if self.patches:
-            patches = _patches(problem, weight, trial)
+            patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
-        if not isinstance(weight, NoiseBalance):
-            weight *= self.share
-        return refine(problem, x, weight, self.share * strength, self.iterations, PnpDct().iterations)
+        return refine(problem, x, weight, strength, self.iterations, PnpDct().iterations)
 
 
 class Finished(NamedTuple):
@@ -282,12 +269,11 @@ def finish(
     settings: FitSettings | None = None,
     control: RunControl | None = None,
     nonnegative: bool = True,
-    share: float = 1.0,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
-    The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB. Where voxels
-    cannot explain the views, what Gaussians alone explain is taken off them before, see `beyond_voxels`.
+    The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB. Matter beyond
+    the box is taken off them before, see `beyond_voxels`.
 
     Single pixels that stand out in all views alike become rings. They are brought back to their neighbours first, see
     `ring_offsets`. Memory: 8 volumes and 5 times the projections.
@@ -296,13 +282,12 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, and the weights of their rays.
-        sweeps: of total variation, 1 or more; None: 8 times `share`, and steps with sparse patches where these predict
+        sweeps: of total variation, 1 or more; None: 8, and steps with sparse patches where these predict
             views held out better.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. Its decisions may
             hold the prior, see `judged`.
         nonnegative: voxels below zero are clipped.
-        share: of the prior that views held out choose from FBP, see `settings.share_of_prior`.
 
     Raises:
         ValueError: for shapes that disagree, or no sweeps.
@@ -314,12 +299,12 @@ def finish(
     data, weights = prepared
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     projector, decide = Projector(problem.geometry, volume.grid), control.decide or Decisions(problem.seed)
-    beyond = beyond_voxels(gaussians, problem.geometry, start, fit)
+    beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views), sweeps or max(1, round(share * FINISH_SWEEPS))
+    watch, count = _Watch(control, problem.geometry.n_views, PnpDct().trial_sweeps), sweeps or FINISH_SWEEPS
     refined = solve(
-        _Finish(count, sweeps is None, share), projector, data, weight=weights, start=start, nonnegative=nonnegative,
+        _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
         watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
     )  # fmt: skip
     return Finished(refined, count)

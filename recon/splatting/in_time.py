@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
-from recon.splatting.finish import SUBSETS, TV_STEPS
+from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps, is_coarse
+from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
@@ -103,10 +102,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
-    if is_coarse(geometry, grid):
-        most = before + FINISH_SWEEPS * sweep + choice
-    else:
-        most = before + (FINISH_SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+    most = before + (FINISH_SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
     if choice and most <= min(seconds, beside_steps):
         return FinishPlan(None, most)
     trials = before + choice + FINISH_SWEEPS * sweep <= seconds

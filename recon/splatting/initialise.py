@@ -13,19 +13,7 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from recon.base.binning import bin_views
 from recon.base.choices import Filter
 from recon.base.choices import Start as Start
-from recon.base.empirical import (
-    AT_THE_EDGE,
-    EMPTY,
-    LEAST_GAUSSIANS,
-    MOST_GAUSSIANS,
-    SMOOTHED,
-    SPREAD,
-    START_SWEEPS,
-    START_WEIGHT,
-    VOXELS_A_GAUSSIAN,
-    WILD_PIXEL,
-    WILD_VIEWS,
-)
+from recon.base.empirical import EMPTY, SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.masks import masked
@@ -41,6 +29,12 @@ from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector, volume_lines
 from recon.voxels.tv import difference_weights
 from recon.voxels.view_weights import angular_weights
+
+START_SWEEPS = 10
+"""Of these sweeps; with momentum, more fit the noise. Without: not measured."""
+
+LEAST_GAUSSIANS, MOST_GAUSSIANS = 2000, 200_000
+"""Bounds of that number. Without: small fields get too few, and large ones more than 400 steps place; not measured."""
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
@@ -154,7 +148,8 @@ def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bo
     width = max(2, cols // 50)
     edges = np.stack((projections[..., :width].mean(axis=(1, 2)), projections[..., -width:].mean(axis=(1, 2))), 1)
     inside = float(np.median(projections.mean(axis=(1, 2))))
-    return bool(np.median(edges[away > AT_THE_EDGE * away.max()]) > EMPTY * inside)
+    far = away >= away.max(axis=1, keepdims=True) if geometry.is_off_middle else np.ones_like(away, np.bool_)
+    return bool(np.median(edges[far]) > EMPTY * inside)
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -211,7 +206,7 @@ def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid
 
 def start_method(geometry: Geometry, start: Start) -> OsSirtTv | None:
     """The sweeps that make the first volume; None: FBP or FDK does."""
-    return OsSirtTv(iterations=START_SWEEPS, tv_weight=START_WEIGHT, momentum=True) if _swept(geometry, start) else None
+    return OsSirtTv(iterations=START_SWEEPS, momentum=True) if _swept(geometry, start) else None
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:

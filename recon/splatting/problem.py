@@ -121,7 +121,7 @@ def extend(problem: FitProblem, projections: F32, angles: NDArray[np.float64]) -
 
 
 def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
-    """The problem with other line integrals [view, row, col] for the views that it has.
+    """The same problem with the line integrals [view, row, col] of its views replaced.
 
     Raises:
         ValueError: a view has no value that can be used.

@@ -12,7 +12,7 @@ import numpy as np
 from recon.assess.plans import PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
-from recon.base.empirical import DEFAULT_STEPS, FINISH_SWEEPS, MODEL_STEPS
+from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
@@ -20,9 +20,10 @@ from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
+from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.settings import FitSettings, growth
+from recon.splatting.settings import MODEL_STEPS, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.splatting.work import fit_costs

@@ -15,7 +15,6 @@ from recon.base.empirical import (
     TV_MOST,
     TV_OF_NOISE,
     TV_SHARE,
-    TV_WIDEST,
     VIEWS_A_STEP,
 )
 from recon.base.kernel import Kernel
@@ -24,6 +23,12 @@ from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
+
+MODEL_STEPS = 50
+"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
+
+TV_WIDEST = 96
+"""Voxels of that side, at most. Without: a step in 512³ voxels takes longer; not measured."""
 
 NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 
@@ -100,17 +105,8 @@ def in_steps(settings: FitSettings, steps: float) -> FitSettings:
     Its rates fall with their square root. So does the least weight of total variation, which a short fit needs to be
     smooth.
     """
-    share = share_of_prior(settings, steps)
+    share = min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
     return replace(settings, pace=share * settings.pace, tv_least=share * settings.tv_least)
-
-
-def share_of_prior(settings: FitSettings, steps: float) -> float:
-    """The share of its prior, and of its sweeps, that the finish of so long a fit keeps where voxels are coarse.
-
-    Views held out choose the prior for volumes that begin at FBP, and too heavy where voxels are coarse. A longer fit
-    has explained more, and a whole finish takes it away: 3.8 dB of a teapot after 1600 steps (docs/choosing.md).
-    """
-    return min(1.0, math.sqrt(settings.paced_for / max(steps, 1.0)))
 
 
 def tv_weight(settings: FitSettings, problem: FitProblem, count: int) -> float:

@@ -5,7 +5,7 @@ anew when the views have grown by half: from the model's volume and an FBP of it
 stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
 clones and splits them where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any
 number of steps to come (`anytime`). The first step after its arrival learns a view. Every third other step takes one of
-the newest views, the rest replay all views evenly (`arrivals`).
+the newest views, the rest replay all views evenly (`arrivals`). One view of sixteen is held out until the last round.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
+from recon.splatting.shown import HeldOutErrors, ShownVolume
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
@@ -106,6 +107,11 @@ class StreamingFit:
         return len(self._angles)
 
     @property
+    def n_unlearnt(self) -> int:
+        """Views that no step has taken yet."""
+        return len(self._unseen)
+
+    @property
     def settings(self) -> FitSettings:
         return self._settings
 
@@ -130,7 +136,9 @@ class StreamingFit:
             self._problem = extend(self._problem, images, theta)
         self._angles.extend(theta.tolist())
         if self._state is not None:
-            self._unseen += range(self.n_views - theta.size, self.n_views)
+            self._unseen += [
+                view for view in range(self.n_views - theta.size, self.n_views) if not arrivals.held_out(view)
+            ]
             measured, rendered = self.newest_view()
             left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
             kept = self.unlearnt if math.isfinite(self.unlearnt) else left
@@ -215,14 +223,21 @@ class StreamingFit:
             self._begin_round()
         if self._state is None or self._problem is None:
             return self.progress()
-        first = self._state.step
+        steps = 0
         while True:
-            view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
-            fit.step(self._state, self._problem, self._settings, self._fraction(), view)
+            fit.step(self._state, self._problem, self._settings, self._fraction(), self._next_view(self._state))
             average(self._state, self._schedule_step)
+            steps += 1
             if (spent := self._now() - begin) >= seconds:
-                self.step_seconds = spent / (self._state.step - first)
+                self.step_seconds = spent / steps
                 return self.progress()
+
+    def _next_view(self, state: fit.FitState) -> int | None:
+        """The first view of the next step; None: any in turn, but for those held out, which the last round takes."""
+        if len(state.drawn) < self._settings.views_per_step:
+            state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not arrivals.held_out(view)]
+        view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
+        return None if view is None or arrivals.held_out(view) else view
 
     @property
     def last_steps(self) -> int:
@@ -270,6 +285,13 @@ class StreamingFit:
         if self._state is None:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
         return fit.volume_of(averaged(self._state), self._grid, self._settings)
+
+    def shown(self) -> ShownVolume:
+        """The volume that predicts views held out better: that of the model, or FBP of the views so far."""
+        if self._problem is None or self._state is None:
+            return ShownVolume(self.snapshot(), False, HeldOutErrors())
+        apart = [view for view in range(self.n_views) if arrivals.held_out(view)]
+        return ShownVolume.of(averaged(self._state), self._problem, self._settings, self._grid, apart)
 
     @property
     def gaussians(self) -> Gaussians | None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.empirical import MODEL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
@@ -47,9 +46,8 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
-from recon.splatting.settings import FitSettings, growth, in_steps, share_of_prior, tv_size, tv_weight
+from recon.splatting.settings import MODEL_STEPS, FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import is_coarse
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
@@ -394,12 +392,8 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
     if method.seconds is not None:
         control = control.by(run.end)
     control = replace(control, stop_trials=None if length.trials else lambda: True)
-    coarse = is_coarse(run.views.fitted.geometry, volume.grid)
-    share = share_of_prior(method.fit, run.state.step) if coarse else 1.0
-    if method.finish is None and length.sweeps is not None:  # those that the time suffices for
-        length.sweeps = max(1, round(share * length.sweeps))
     finished, sweeps = finish(
-        volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative, share
+        volume, model, run.views.fitted, length.sweeps, method.fit, control, not method.allow_negative
     )  # fmt: skip
     if kept_back.size:
         views = run.views.all_geometry.select(kept_back)

@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 
 from recon.assess.plans import Speeds
-from recon.base.empirical import FINISH_SWEEPS, FIRST_SHARE, TRIAL_STEPS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import CLOCK, Costs, Rates, Work
-from recon.splatting.finish import SUBSETS, TV_STEPS
+from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_method
 from recon.splatting.settings import FitSettings, growth
 from recon.voxels.direct import direct_work
-from recon.voxels.held_out import LEAST_VIEWS, is_coarse
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
 from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.pnp_dct import TRIAL_STEPS
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
@@ -33,10 +33,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
     """The work of `train.run_fit`."""
     if method.planned_steps is None:
         return Costs({method.name: Work.of(CLOCK, method.seconds or 0.0)})
-    weight, patches = (
-        weight_choice(geometry, grid),
-        Work() if is_coarse(geometry, grid) else patch_choice(geometry, grid),
-    )
+    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid)
     fit = _fit(method, geometry, grid, method.planned_steps)
     if not method.by_content or geometry.n_views < LEAST_VIEWS:
         if method.finish_sweeps == 0:
@@ -92,7 +89,7 @@ def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
     """The refinement on voxels, with steps of sparse patches where these may follow."""
     refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS)) + _rendered(method, geometry, grid)
     refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
-    if method.finish is not None or is_coarse(geometry, grid):
+    if method.finish is not None:
         return refined
     return refined + patch_steps(geometry, grid, PnpDct().iterations)
 

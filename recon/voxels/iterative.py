@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -20,9 +20,10 @@ from numba import get_num_threads, set_num_threads
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
+from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import VoxelProblem
 
 UNITS = "units"  # name of the decision on them
@@ -44,13 +45,15 @@ class IterativeMethod(Protocol):
 
 @runtime_checkable
 class PreparedMethod(IterativeMethod, Protocol):
-    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations.
-
-    `trial_sweeps`: sweeps of all of its trials, as a rule.
-    """
+    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations."""
 
     @property
     def first_sweeps(self) -> int: ...
+
+
+@runtime_checkable
+class ChoosingPrior(IterativeMethod, Protocol):
+    """An iterative method whose trials choose its prior; `trial_sweeps`: those of all trials, as a rule."""
 
     @property
     def trial_sweeps(self) -> int: ...
@@ -110,16 +113,18 @@ def solve(
     decide = decide or Decisions()
     units = _Units(*decide(UNITS, lambda: _Units.of(projector, data, rays)))
     inside = units.enter(projector, data, rays, lines)
+    at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
 
     problem = VoxelProblem(
         inside,
-        data,
+        at_voxels,
         rays,
         nonnegative,
         np.random.default_rng(decide.seed),
         lambda iteration, residual: not watch.on_iteration(iteration, residual),
         decide,
         lambda: not watch.on_trial(),
+        measured=None if at_voxels is data else data,
     )
     threads = get_num_threads()
     try:
@@ -141,6 +146,18 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     history: list[Progress] = []
     planned = method.iterations + (method.first_sweeps if isinstance(method, PreparedMethod) else 0)
 
+    trials, trial = method.trial_sweeps if isinstance(method, ChoosingPrior) else 0, 0
+
+    def on_trial() -> bool:
+        nonlocal trial
+        trial += 1
+        if control.on_progress is not None:
+            nan, of = math.nan, max(trials, trial)
+            control.on_progress(
+                Progress(trial, of, control.now() - begin, nan, nan, 0, geometry.n_views, unit=SWEEPS_OF_TRIALS)
+            )
+        return control.stop_of_trials()
+
     def report(iteration: int, residual: float) -> bool:
         seconds = control.now() - begin
         history.append(Progress(iteration, planned, seconds, residual, residual, 0, geometry.n_views))
@@ -154,7 +171,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     volume = solve(
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        watch=Watch(report, control.stop_of_trials), decide=decide,
+        watch=Watch(report, on_trial), decide=decide,
     )  # fmt: skip
     chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
     return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
@@ -197,7 +214,8 @@ class _Units(NamedTuple):
         views, box = projector.geometry, projector.grid
         edge, slices = (math.ldexp(n, -self.length) for n in (box.voxel_size, box.spacing[0]))
         z, y, x = (math.ldexp(n, -self.length) for n in box.centre)
-        return Projector(views.scaled(math.ldexp(1.0, -self.length)), Grid(box.shape, edge, (z, y, x), slices))
+        grid = Grid(box.shape, edge, (z, y, x), slices)
+        return replace(projector, geometry=views.scaled(math.ldexp(1.0, -self.length)), grid=grid)
 
 
 def _times_power(array: F32, power: int) -> F32:

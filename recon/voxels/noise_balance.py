@@ -59,14 +59,19 @@ class NoiseBalance:
             evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
                 views is alike.
         """
-        data = whitened(problem.data, problem.weight)
-        noise = noise_beside_structure(data, problem.projector.geometry) if evenly else noise_level(data)
+
+        def noise_of(views: F32) -> float:
+            seen = whitened(views, problem.weight)
+            return noise_beside_structure(seen, problem.projector.geometry) if evenly else noise_level(seen)
+
+        noise = noise_of(problem.views)
         first = problem.filtered("hann")
         volume = start if first is None else np.maximum(first, 0, out=first)
         variation = total_variation(volume, difference_weights(problem.projector.grid))
         matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
         share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
-        return cls(share, noise * _by_views(problem.projector.geometry), sweeps)
+        left = noise if problem.measured is None else noise_of(problem.data)
+        return cls(share, left * _by_views(problem.projector.geometry), sweeps)
 
     def after_sweep(self, residual: F32) -> float:
         """Adapt the weight to the residual (some views [view, col, row], whitened), and return it."""

@@ -31,25 +31,26 @@ class Subsets:
         views: indices, of each subset.
         projectors: of these views.
         step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most.
+        plain_norm: the same eigenvalue, of the projector that is not sharpened.
     """
 
     views: Sequence[NDArray[np.intp]]
     projectors: Sequence[Projector]
     step: float
+    plain_norm: float
 
     @classmethod
     def of(cls, problem: VoxelProblem, most: int, fewest: int = 1) -> Subsets:
         """At most so many; see `subsets_of`."""
         projector, weight = problem.projector, problem.weight
-        count = subsets_of(projector.geometry, most, fewest)
-        if count == 1:
-            return cls(interleaved(projector, 1), [projector], 1 / largest_eigenvalue(projector, weight))
+        count, heaviest = subsets_of(projector.geometry, most, fewest), 0
         views = interleaved(projector, count)
-        projectors = [projector.subset(some) for some in views]
-        if weight is None:
-            return cls(views, projectors, 1 / largest_eigenvalue(projectors[0], None))
-        heaviest = int(np.argmax([float(weight[some].sum(dtype=np.float64)) for some in views]))
-        return cls(views, projectors, 1 / largest_eigenvalue(projectors[heaviest], weight[views[heaviest]]))
+        projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
+        if weight is not None and count > 1:
+            heaviest = int(np.argmax([float(weight[some].sum(dtype=np.float64)) for some in views]))
+            weight = weight[views[heaviest]]
+        norm = largest_eigenvalue(projectors[heaviest].plain, weight)
+        return cls(views, projectors, 1 / (norm * projectors[heaviest].gain), norm)
 
 
 def ordered_fista(

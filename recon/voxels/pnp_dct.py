@@ -12,8 +12,12 @@ from recon.base.empirical import FALL, PULL
 from recon.base.noise import noise_beside_structure
 from recon.kernels.cpu.patches import denoise, patch_scratch, pulled_step
 from recon.kernels.cpu.vectors import replace_by_residual
+from recon.voxels.resolution import smoothed
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
+
+TRIAL_STEPS = 15
+"""Steps with patches. Without, with all 35: level within 0.1 dB, and half as much CPU time again."""
 
 STEPS = 5
 """Steps towards the views between two thresholds."""
@@ -81,9 +85,10 @@ def noise_of_volume(problem: VoxelProblem) -> float:
     if problem.weight is not None:
         np.divide(data, np.sqrt(problem.weight), out=data, where=problem.weight > 0)
         data[problem.weight == 0] = 0
+    data = smoothed(data, problem.projector.resolution, None if problem.weight is None else problem.weight > 0)
     alone = replace(problem, data=data, nonnegative=False, go_on=lambda *_: True)
     nz, ny, nx = problem.projector.grid.shape
     x, z = (np.zeros((ny, nx, nz), np.float32) for _ in range(2))
     towards_views(alone, x, z, largest_eigenvalue(problem.projector, problem.weight), steps=STEPS)
-    noise = noise_beside_structure(whitened(problem.data, problem.weight), problem.projector.geometry)
+    noise = noise_beside_structure(whitened(problem.views, problem.weight), problem.projector.geometry)
     return noise * float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))

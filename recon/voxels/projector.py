@@ -33,8 +33,8 @@ from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 from recon.kernels.cpu.spread import spread
 from recon.kernels.cpu.vectors import combine
+from recon.voxels.resolution import Resolution, levels, on_rows
 
-_ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 _LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
@@ -62,6 +62,9 @@ class Projector:
 
     geometry: Geometry
     grid: Grid
+    matched: bool = True
+    resolution: Resolution = field(init=False, repr=False)
+    _sharpened: NDArray[np.float64] | None = field(init=False, repr=False)
     _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -78,15 +81,43 @@ class Projector:
             for band, views in bands_of(self.geometry, self.grid)
         ]
         object.__setattr__(self, "_bands", found)
+        object.__setattr__(self, "resolution", Resolution.of(self.geometry, self.grid))
+        sharpened = self.resolution.sharpened
+        if not self.matched:
+            sharpened = np.minimum(sharpened, 0)
+        if self.geometry.detector_shape[0] == 1:
+            sharpened[:, 1] = 0
+        object.__setattr__(self, "_sharpened", sharpened if sharpened.any() else None)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
         """(views, rows, cols)."""
         return (self.geometry.n_views, *self.geometry.detector_shape)
 
+    @property
+    def plain(self) -> Projector:
+        """The same without sharpening: no entry of its matrix is negative."""
+        return replace(self, matched=False) if self.matched else self
+
+    @property
+    def gain(self) -> float:
+        """A bound of the largest eigenvalue of AᵀA over that of `plain`.
+
+        Sharpening by s raises the finest detail by 1 + 2 s. Along rows, all views see it. Along columns only views do
+        whose angles differ by less than a voxel at the edge of the field, and all see the largest eigenvector.
+        """
+        if self._sharpened is None:
+            return 1.0
+        cols, rows = ((1 + 2 * max(float(most), 0.0)) ** 2 for most in self._sharpened.max(0))
+        angles = np.sort(np.mod(self.geometry.angles, np.pi))
+        turns = np.concatenate((angles, angles + np.pi))
+        alike = np.searchsorted(turns, turns + 2 / self.geometry.detector_shape[1], "right") - np.arange(turns.size)
+        share = min(int(alike.max()) / angles.size, 1.0)
+        return rows * (1 + (cols - 1) * share)
+
     def subset(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Projector:
         """The same for some views only, in that order."""
-        return Projector(self.geometry.select(views), self.grid)
+        return replace(self, geometry=self.geometry.select(views))
 
     def __call__(self, volume: F32) -> F32:
         """A x, as `forward`."""
@@ -173,11 +204,10 @@ class Projector:
             joseph_cpu.adjoint(projections, *rays[:2], out)
 
     def _spread(self, lines: F32) -> F32:
-        """Lines [view, col, row] with the width of a pixel; its own transpose."""
-        variance = self.geometry.width.variance
-        if variance == 0:
+        """Lines [view, col, row] at the resolution of the views, see `Resolution`; its own transpose."""
+        if self._sharpened is None:
             return lines
-        return spread(lines, np.full(len(lines), variance), variance)
+        return spread(lines, -self._sharpened[:, 0], -self._sharpened[:, 1])
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
         """The row on which z = 0 falls in each view, and the slice at z = 0."""
@@ -185,10 +215,7 @@ class Projector:
         return self.geometry.axis_row + self.geometry.shifts[:, 1], middle
 
     def _levels(self) -> tuple[NDArray[np.float64], float]:
-        """The slice (fractional) that the first row of each view sees, and slices a row; parallel beam."""
-        rows, middle = self._heights()
-        step = self.geometry.pixel_pitch / self.grid.spacing[0]
-        return middle - rows * step, step
+        return levels(self.geometry, self.grid)
 
     def _in_one_slice(self) -> bool:
         """All rays of straight views run in the plane of the only slice: a parallel beam, or a fan."""
@@ -200,15 +227,7 @@ class Projector:
     def _to_rows(self) -> bool:
         """The kernels give rows of the detector, not lines of slices: each ray has a height of its own, or slice k lies
         on row k of every view."""
-        return not self.geometry.is_straight or self.geometry.is_cone or self._on_rows()
-
-    def _on_rows(self) -> bool:
-        """Slice k lies on row k of every view."""
-        first, step = self._levels()
-        nz = self.grid.shape[0]
-        return nz == self.geometry.detector_shape[0] and bool(
-            np.abs(first).max() < _ON_ROWS and abs(step - 1) * nz < _ON_ROWS
-        )
+        return not self.geometry.is_straight or self.geometry.is_cone or on_rows(self.geometry, self.grid)
 
 
 def views_of_exposure(geometry: Geometry) -> list[Geometry]:

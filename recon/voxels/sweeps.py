@@ -52,8 +52,9 @@ class Sweeps:
             measured = data[views] if len(subsets) > 1 else data
             rays = None if weight is None else (weight[views] if len(subsets) > 1 else weight)
             self._gradient[...] = 1
-            scale = _inverse(part.forward_lines(self._gradient))
-            part.adjoint_lines(np.ones_like(scale) if rays is None else rays, self._gradient)
+            plain = part.plain  # sums of absolute values, but for less than 2 in a step
+            scale = _inverse(plain.forward_lines(self._gradient))
+            plain.adjoint_lines(np.ones_like(scale) if rays is None else rays, self._gradient)
             np.maximum(self._step, self._gradient, out=self._step)
             if rays is not None:
                 scale *= rays

@@ -35,6 +35,7 @@ class VoxelProblem:
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
         decide: keeps decisions that follow from sums over the whole volume or all rays.
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
+        measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
     """
 
     projector: Projector
@@ -45,6 +46,12 @@ class VoxelProblem:
     go_on: Callable[[int, float], bool]
     decide: Decisions = field(default_factory=Decisions)
     trial_goes_on: Callable[[], bool] = lambda: True
+    measured: F32 | None = None
+
+    @property
+    def views(self) -> F32:
+        """The views [view, col, row] as measured."""
+        return self.data if self.measured is None else self.measured
 
     @property
     def scale(self) -> float:
@@ -54,11 +61,12 @@ class VoxelProblem:
     def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
         """Data and weights of some views; the projector stays that of all views."""
         weight = None if self.weight is None else self.weight[views]
-        return replace(self, data=self.data[views], weight=weight)
+        measured = None if self.measured is None else self.measured[views]
+        return replace(self, data=self.data[views], weight=weight, measured=measured)
 
     def filtered(self, filter: Filter) -> F32 | None:
         """FBP or FDK [y, x, z] of the views with some weight, rays of weight 0 filled in; None: neither takes them."""
-        images, geometry = projection_images(self.data), self.projector.geometry
+        images, geometry = projection_images(self.views), self.projector.geometry
         if self.weight is not None:
             seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
             geometry = geometry.select(seen)
@@ -105,7 +113,8 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
 
     For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
-    So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side.
+    So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side. A
+    matched projector has negative entries: the bound is that of the plain one, times `Projector.gain`.
     Where each row sees one slice, and all rows are alike, it is computed on sixteen rows.
     """
     geometry, slices = projector.geometry, projector.grid.shape[0]
@@ -114,7 +123,8 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
         some, grid = geometry.rows(0, POWER_ROWS), projector.grid
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
         box = replace(grid, shape=(POWER_ROWS, *grid.shape[1:]), centre=centre)
-        projector = Projector(some, box)
+        projector = Projector(some, box, projector.matched)
+    gain, projector = projector.gain, projector.plain
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf
@@ -128,7 +138,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
         if bound == 0:
             return math.inf  # no ray meets the box
         x = product / product.max()
-    return bound
+    return gain * bound
 
 
 def slices_are_rows(projector: Projector) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from recon.base.empirical import ONE_IN, TRIAL_STEPS, TRIAL_SWEEPS
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.base.work import Work
@@ -15,11 +15,12 @@ from recon.voxels.held_out import (
     LEAST_VIEWS,
     SUBSETS,
     TRIAL_ROWS,
+    TRIAL_SWEEPS,
     TRIALS,
     TV_STEPS,
 )
 from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.pnp_dct import STEPS
+from recon.voxels.pnp_dct import STEPS, TRIAL_STEPS
 from recon.voxels.projector import Projector, views_of_exposure
 from recon.voxels.voxel_problem import POWER_ROUNDS, POWER_ROWS
 

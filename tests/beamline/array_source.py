@@ -31,6 +31,9 @@ class ArraySource:
     row_period: float | None = None
     flags = None
     currents: NDArray[np.float64] | None = None
+    energies: NDArray[np.float64] | None = None
+    pixel_mask = None
+    used: tuple[Any, ...] = ()
     replaces = None
     shifts: NDArray[np.float64] | None = None
     part_starts: NDArray[np.int64] = np.zeros(1, np.int64)

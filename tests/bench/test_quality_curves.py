@@ -19,11 +19,11 @@ import recon
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES, QualityCurve
 from recon.base.binning import bin_views
-from recon.base.empirical import FINISH_SWEEPS
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.methods import build, by_name
+from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp

@@ -89,7 +89,6 @@ ROWS: dict[str, Callable[[Path], Case]] = {
 }
 ALL = "shell", "teapot", "foam", "walnut", "bone", "cement", "teapot, cone", "region"
 PATCHES = "foam", "walnut", "bone", "cement"
-CONES = "teapot, cone", "shell, cone"
 FITS = "shell", "teapot", "teapot, cone", "12 shell", "12 foam", "12 bone", "12 cement"
 BY_NOISE = "foam", "walnut", "bone", "cement", "180 bone", "180 cement"
 
@@ -114,9 +113,6 @@ def _fit(**settings: Any) -> recon.R2:
 
 
 REMOVED: dict[str, Removed] = {
-    "COARSE": Removed(math.inf, CONES),
-    "ALIKE": Removed(0.0, CONES),
-    "OF_MATTER": Removed(-math.inf, CONES),
     "AIR": Removed(0.0, ALL),
     "TRIAL_SWEEPS": Removed(8, PATCHES),
     "TRIAL_STEPS": Removed(35, PATCHES),

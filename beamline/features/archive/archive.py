@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import h5py
+import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +24,6 @@ from beamline.core.files import run_of, whole_file
 from beamline.core.text import count, spans
 from beamline.monitor.digest import checksum_of, has_checksum
 from beamline.storage import hdf5
-from beamline.storage.codecs import filter_of
 from beamline.storage.parts import joined_file_of, other_parts, to_join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.scan import altered_sentence
@@ -211,6 +211,16 @@ def _same(one: Any, other: Any) -> bool:
     if a.ndim:
         return a.shape == b.shape and all(_same(x, y) for x, y in zip(a.ravel(), b.ravel(), strict=True))
     return bool(a == b)
+
+
+def filter_of(codec: str) -> Mapping[str, Any]:
+    """The keywords of an HDF5 dataset that is compressed by a codec of these."""
+    filters: Mapping[str, Any] = {
+        "blosc2": hdf5plugin.Blosc2("zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE),
+        "bitshuffle-zstd": hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
+        "bitshuffle-lz4": hdf5plugin.Bitshuffle(cname="lz4"),
+    }[codec]
+    return filters
 
 
 class _CompressedCopy:

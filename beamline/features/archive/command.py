@@ -11,10 +11,10 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, size, spans
-from beamline.storage.codecs import CODECS
 from drivers.base.clock import SystemClock
 
 _PATH = click.Path(path_type=Path)
+CODECS = ("blosc2", "bitshuffle-zstd", "bitshuffle-lz4")  # The first is the default
 
 
 @click.command()

@@ -205,7 +205,7 @@ class Worker:
             code: int | None = self._code
         else:
             code = None if silent else process.code
-            reason = f"it hung: no word from it for {self._silence:g} s" if silent else reason
+            reason = f"no output from the worker for {self._silence:g} s; it was ended" if silent else reason
         if code not in _WITH_VOLUME:
             self.end()
         return code, reason

@@ -31,7 +31,7 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     from beamline.page.followed_run import PERIOD
 
     with closing(RunServer(runs, prefix, bind, control, say)) as server, suppress(KeyboardInterrupt):
-        click.echo(f"{prefix}ScanStatus and others at {bind} (docs/epics.md). Ctrl-C ends this, not the scan.")
+        click.echo(f"{prefix}ScanStatus and others at {bind} (docs/page.md). Ctrl-C ends this, not the scan.")
         while True:
             server.look()
             time.sleep(PERIOD)

@@ -18,13 +18,13 @@ from PIL import GifImagePlugin, Image
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import whole_file
 from beamline.storage.recon_record import ReconRecord
+from recon.base.greys import matter_window
 
 F32 = NDArray[np.float32]
 MOST_IMAGES = 600  # of a film: of more slices or views every second, third ... is shown
 LONGEST_SIDE = 2048  # pixels of an image
 HELD_BYTES = 2**28  # bytes of the images across y or x that one pass over the volume fills
 _LOOKED_AT, _VALUES = 9, 2**18  # slices or views, and values of each, that tell the grey window
-_PERCENT = 0.1, 99.9  # of these values, which become black and white
 _GIF_TICK = 0.01  # s; a GIF states the time of an image in whole ones
 
 
@@ -156,15 +156,13 @@ def _size(shape: tuple[int, ...], ratio: float, side: int) -> tuple[int, int]:
 def _window(some: Iterator[F32]) -> tuple[float, float]:
     values = [image.ravel()[:: max(1, image.size // _VALUES)] for image in some]
     finite = np.concatenate([part[np.isfinite(part)] for part in values])
-    low, high = np.percentile(finite, _PERCENT).tolist() if finite.size else (0.0, 0.0)
-    if low == high and finite.size:
-        low, high = float(finite.min()), float(finite.max())
-    if low == high:
+    if not finite.size or finite.min() == finite.max():
+        low = float(finite[0]) if finite.size else 0.0
         raise ConfigError(
             f"Every value of the {len(values)} images looked at is {low:g}, or not finite: give --window LOW:HIGH. "
             "Nothing was written."
         )
-    return low, high
+    return matter_window(finite)
 
 
 _Write = Callable[[Path, Iterator[NDArray[np.uint8]]], tuple[int, int]]

@@ -77,7 +77,7 @@ def info(
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
     facts.pop("returned", None)
-    attributes = {**attributes, **facts.pop("not_used", {})}
+    attributes = {**attributes, **facts.pop("used", {}), **facts.pop("not_used", {})}
     if facts.get("flags") is not None:
         facts["flags"] = counted(facts["flags"])
     width = max(len(name) for name in (*facts, *attributes)) + 2

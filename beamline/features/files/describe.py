@@ -61,9 +61,9 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 def describe_source(source: ScanSource, clock: Callable[[], float] = time.monotonic) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
 
-    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
-    is what the file states and nobody uses, by its path. `findings` are the messages of errors and warnings,
-    `reconstructable` whether no error stands against a reconstruction.
+    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `used` are
+    the numbers that the file states and somebody uses, by path, `not_used` those that nobody does. `findings` are the
+    messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     until = clock() + LOOK
@@ -95,6 +95,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     return {
         **facts,
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
+        "used": {field.where: f"{field.value} (used: {field.use})" for field in source.used},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
         + ([altered_sentence(source)] if source.altered else []),

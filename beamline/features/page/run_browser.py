@@ -14,7 +14,7 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, leads_away, parts_of
+from beamline.core.files import EVENTS, is_link, parts_of
 from beamline.features.page.app import Access, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, Run, cells, describe, runs_in
@@ -95,7 +95,7 @@ def _by_a_stranger(folder: Path, run: Path) -> bool:
     if not hasattr(os, "geteuid"):
         return False
     way = [run, *run.parents]
-    links = [place for place in way[: way.index(folder)] if leads_away(place)]
+    links = [place for place in way[: way.index(folder)] if is_link(place)]
     return any(link.lstat().st_uid not in (0, os.geteuid()) for link in links)
 
 

@@ -12,18 +12,18 @@ from typing import Any
 import h5py
 import numpy as np
 from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
 from beamline.core.shipped import version
-from beamline.report.figures import downwards, grey_window, png, show_grey
+from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import axes_of
 from beamline.storage.volumes.files import whole_volume
 from beamline.storage.writers.recon_file import DEVIATION
+from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.features.particles.particles import (
     NECK,
@@ -256,22 +256,19 @@ def _write_labels(partial: Path, found: Segmented, options: SegmentOptions) -> N
             data[name].attrs["units"] = found.unit
 
 
-_SLICES, _WIDTH, _DPI = 3, 8.6, 110
-_COLOURS = 12
+_SLICES, _COLOURS = 3, 12
 
 
 def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: Particles) -> bytes:
     """Three slices as they are, the same with each particle in a colour, and a histogram of diameters, as PNG."""
     z, y, x = volume.grid.coordinates()
     at = np.linspace(0, z.size - 1, _SLICES + 2).round().astype(int)[1:-1]
-    half = volume.grid.voxel_size / 2
-    extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
-    column = _WIDTH / _SLICES
-    figure = Figure(figsize=(_WIDTH, 2 * column * y.size / x.size + 3.2), dpi=_DPI, layout="constrained")
+    extent, column = slice_extent(volume.grid), WIDTH / _SLICES
+    figure = new_figure((WIDTH, 2 * column * y.size / x.size + 3.2))
     ratios = (2 * column * y.size / x.size + 0.8, 2.4)
     upper, lower = np.ravel(figure.subfigures(2, 1, squeeze=False, height_ratios=ratios))
     panels = upper.subplots(2, _SLICES, sharex=True, sharey=True)
-    window = grey_window([volume.data[at]])
+    window = matter_window(volume.data[at])
     # Neighbours in the order of labels get different colours; the same colour comes again after twelve.
     colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
     for column_of, k in zip(panels.T, at, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -51,8 +52,8 @@ class QueueStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class TakenScan:
-    """A scan, or a series of energies, that was taken: where it is, and the faults of its frames, a sentence each."""
+class RecordedScan:
+    """A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
 
     path: Path
     faults: tuple[str, ...] = ()
@@ -125,17 +126,17 @@ def load_queue(files: Sequence[Path], overrides: Sequence[str], *, rehearse: boo
 def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
     """Place, configuration and overrides of each line of a table."""
     try:
-        lines = text_in(table, SETTINGS).splitlines()
-        rows = [[cell.strip() for cell in row] for row in csv.reader(lines, strict=True)]
+        reader = csv.reader(io.StringIO(text_in(table, SETTINGS), newline=""), strict=True)
+        numbered = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except (OSError, csv.Error) as error:
         raise ConfigError(f"{table} cannot be read as a table ({error}). Nothing was started.") from None
-    head = rows[0] if rows else []
-    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for row in rows[1:]):
+    head = numbered[0][1] if numbered else []
+    if _CONFIG not in head or "" in head or len(set(head)) < len(head) or not any(any(row) for _, row in numbered[1:]):
         raise ConfigError(
             f"{table} is no table of scans: expected a line of names, such as config,sample.name,scan.exposure_s, each "
             "once, and a line for each scan. Nothing was started."
         )
-    for number, row in enumerate(rows[1:], 2):
+    for number, row in numbered[1:]:
         if not any(row):
             continue
         cells = dict(zip(head, row, strict=False))
@@ -198,7 +199,7 @@ class QueueNeeds:
                 f"{size(self.free_bytes)} free; free some, or choose another storage.folder"
             )
         if faults:
-            raise ConfigError("".join(["the queue cannot be taken, nothing was started:", *_indented(faults)]))
+            raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
 
 
 def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
@@ -218,7 +219,7 @@ def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
 
 def run_queue(
     queue: Sequence[QueuedScan],
-    take: Callable[[int, QueuedScan, StopRequest, RunNotes], TakenScan],
+    take: Callable[[int, QueuedScan, StopRequest, RunNotes], RecordedScan],
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
@@ -287,6 +288,9 @@ def take_all(request: ScanRequest) -> None:
     """Take the scans of a queue, or work them out, and print what became of each."""
     with json_events(request.as_json) as json_sink:
         queue = load_queue(request.files, request.overrides, rehearse=request.rehearse)
+        if request.discard and (series := [scan.name for scan in queue if scan.config.scan.energies is not None]):
+            names = ", ".join(series)
+            raise click.UsageError(f"--discard does not go with scan.energies, of {names}: leave it out.")
         needs = queue_needs(queue, request.output)
         if request.dry:
             if not request.as_json:
@@ -308,7 +312,7 @@ def take_all(request: ScanRequest) -> None:
 
 def _take_next(
     request: ScanRequest, of: int, json_sink: Sink, n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes
-) -> TakenScan:
+) -> RecordedScan:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
         ask_operator(f"Scan {n + 1} of {of}: bring {waiting.name} to its place.")
@@ -316,9 +320,9 @@ def _take_next(
     sinks: list[Sink] = [json_sink, run]
     if waiting.config.scan.energies is not None:
         done = take_energies(waiting.config, request, sinks, stop)
-        return TakenScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
+        return RecordedScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
     with ExitStack() as held:
         result = run_one(waiting.config, None, request, sinks, held, stop)
     if request.rehearse:
         click.echo("\n".join(rehearsed_lines(waiting.config, result, request)), err=True)
-    return TakenScan(result.path, tuple(faults_of(result)))
+    return RecordedScan(result.path, tuple(faults_of(result)))

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from beamline.report.figures import grey_window, png
+from beamline.report.figures import grey_window, new_figure, png
 from drivers.base.frame import FrameKind
 from simulators.effects.chain import Anomaly
 from simulators.scenes.expose import Scan, expose
@@ -32,7 +31,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     low, high = grey_window(views, 0.5, 99.8)
     rows = -(-len(frames) // COLUMNS)
     tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
-    figure = Figure(figsize=(10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), dpi=110)
+    figure = new_figure((10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), constrained=False)
     anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
     for place, ((number, planned), frame) in enumerate(zip(chosen, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)

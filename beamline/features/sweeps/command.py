@@ -29,6 +29,7 @@ from beamline.core.events import Done
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.sinks import Warnings
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
+from beamline.report.metrics import METRICS
 from drivers.base.clock import SystemClock
 from recon.methods import BASELINE
 
@@ -89,7 +90,7 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
     slices, scores = _run(trials, options, path, as_json)
     if not as_json:
         click.echo(f"{_lines(slices, scores)}\nsheet     {path}\ntable     {table}")
-        if scores is not None:
+        if scores is not None and scores.best is not None:
             best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
             again = shlex.join(["beamline", "recon", *common, *best])
             click.echo(f"If the pictures agree: {again}", err=True)
@@ -184,8 +185,8 @@ def _run(
         title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
         write_whole(path.with_suffix(".csv"), table_of(slices, scores))
         write_whole(path, sweep_sheet(slices, scores, options, title))
-        best = None if scores is None else dict(slices[scores.best].values)
-        means = None if scores is None else scores.means.tolist()
+        best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
+        means = None if scores is None else scores.shares.tolist()
         sink(Done({"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means},
                   time=clock.now()))  # fmt: skip
     return slices, scores
@@ -206,6 +207,13 @@ def _remarks(
             "These values change the views that judge the slices: each is compared with the views of every value. "
             "One that all others contradict loses, and the middle of a range is favoured. Look at the pictures first."
         )
+    if scores.best is None:
+        low, high = scores.shares.min(), scores.shares.max()
+        remarks.append(
+            f"The residual of views held out is {low:.4g} to {high:.4g}, nearly the same for all values: it names none "
+            "of them. Look at the pictures."
+        )
+        return remarks
     best = slices[scores.best].values
     for each in options if len(slices) == math.prod(len(each.values) for each in options) else ():
         ends = (each.values[0], each.values[-1]) if each.numbers and len(each.values) > 2 else ()
@@ -220,7 +228,7 @@ def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([*slices[0].values, "residual_held_out", "verdict", "seconds"])
     for n, each in enumerate(slices):
-        residual = "" if scores is None else f"{scores.means[n]:.6g}"
+        residual = "" if scores is None else f"{scores.shares[n]:.6g}"
         writer.writerow([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
     return out.getvalue()
 
@@ -233,10 +241,10 @@ def _verdict(scores: Scores | None, n: int) -> str:
 
 def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     names = list(slices[0].values)
-    head = [*names, "residual of views held out", "", "s"]
+    head = [*names, METRICS["residual_held_out"].label, "", "s"]
     rows = [head]
     for n, each in enumerate(slices):
-        residual = "-" if scores is None else f"{scores.means[n]:.5g}"
+        residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
         rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
     widths = [max(len(row[at]) for row in rows) for at in range(len(head))]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)

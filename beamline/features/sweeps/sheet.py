@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from beamline.features.sweeps.sweep import Scores, SweptSlice
 from beamline.features.sweeps.values import SweptOption
-from beamline.page.volume import grey_windows
 from beamline.report.figures import DPI, WIDTH, png, show_grey
+from beamline.report.metrics import METRICS
+from recon.base.greys import matter_window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +34,7 @@ def sweep_sheet(
     down = -(-len(slices) // across)
     part = _changes_most([each.image for each in slices])
     images = [each.image[part] for each in slices]
-    window = grey_windows(np.concatenate([image.ravel() for image in images]))["matter"]
+    window = matter_window(*images)
     tall, wide = images[0].shape
     height = WIDTH / across * tall / wide + 0.42
     curve = _CURVE if scores is not None and len(options) == 1 else 0.0
@@ -49,7 +50,7 @@ def sweep_sheet(
         if n == 0:
             axes.set(xlabel="x →", ylabel="← y")
         colour = _colour(scores, n)
-        words = each.label if scores is None else f"{each.label}\n{scores.means[n]:.5g}"
+        words = each.label if scores is None else f"{each.label}\n{scores.shares[n]:.5g}"
         axes.set_title(words, fontsize=7, color=colour)
         for side in axes.spines.values():
             side.set(color=colour, linewidth=0.8 if colour == "black" else 2.5)
@@ -66,16 +67,16 @@ def _draw_curve(axes: Axes, slices: Sequence[SweptSlice], scores: Scores, option
     numbers = option.numbers[: len(slices)]
     at = numbers or range(len(slices))
     spread = min(numbers) > 0 and max(numbers) / min(numbers) > 30 if numbers else False
-    axes.plot(at, scores.means, "o-", ms=3, lw=1, color="tab:blue")
+    axes.plot(at, scores.shares, "o-", ms=3, lw=1, color="tab:blue")
     for n, place in enumerate(at):
         if scores.alike[n]:
-            axes.plot([place], [scores.means[n]], "o", color=_colour(scores, n), ms=7)
+            axes.plot([place], [scores.shares[n]], "o", color=_colour(scores, n), ms=7)
     if numbers and spread:
         axes.set_xscale("log")
     if not numbers:
         axes.set_xticks(range(len(slices)), option.values[: len(slices)])
     axes.set_xlabel(option.name, fontsize=8)
-    axes.set_ylabel("residual of views held out", fontsize=8)
+    axes.set_ylabel(METRICS["residual_held_out"].label, fontsize=8)
     axes.tick_params(labelsize=7)
 
 

@@ -19,6 +19,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
+from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.base import ScanSource
@@ -27,9 +28,11 @@ from recon.base.arrays import F32, F64
 from recon.base.empirical import ONE_IN
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance, residuals_by_view
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
+from recon.voxels.resolution import Resolution
 
+_FLAT = 0.05  # share by which a residual must change among the values: an axis of 0.7 columns off changed it by 0.03
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
 
@@ -42,7 +45,7 @@ class SweptSlice:
         image: [y, x] in 1/mm (1/px), the middle slice of the rows.
         seconds: of the reconstruction.
         views: its views held out, corrected as its own options say.
-        projected: [view, row, col] what the volume shows in them.
+        projected: [view, row, col] what the volume shows in them, at this resolution.
     """
 
     values: Mapping[str, str]
@@ -50,6 +53,7 @@ class SweptSlice:
     seconds: float
     views: HeldOutViews
     projected: F32
+    resolution: Resolution
 
     @property
     def label(self) -> str:
@@ -70,7 +74,7 @@ class Scores:
     """How well each slice's volume predicts views held out.
 
     Attributes:
-        residuals: [slice, view] root mean square, as a share of the views' own.
+        residuals: [slice, view] root mean square, as a share of that of all these views.
         corrected_alike: all options give the same views; else each volume is compared with the views by all of them.
     """
 
@@ -78,16 +82,20 @@ class Scores:
     corrected_alike: bool
 
     @property
-    def means(self) -> F64:
-        return np.asarray(self.residuals.mean(axis=1))
+    def shares(self) -> F64:
+        """[slice] the data residual of the views held out, as of `beamline.reconstruct.measure`."""
+        return np.asarray(np.sqrt(np.square(self.residuals).mean(axis=1)))
 
     @property
-    def best(self) -> int:
-        return int(np.argmin(self.means))
+    def best(self) -> int | None:
+        """The slice of the least residual; None where the residual hardly depends on the values."""
+        return int(np.argmin(self.shares)) if np.ptp(self.shares) > _FLAT * self.shares.min() else None
 
     @property
     def alike(self) -> list[bool]:
         """Which slices are told from the best one by no more than chance; also the best one itself."""
+        if self.best is None:
+            return [False] * len(self.residuals)
         best = self.residuals[self.best]
         return [not beyond_chance(own - best, 1.0) or n == self.best for n, own in enumerate(self.residuals)]
 
@@ -156,9 +164,10 @@ def sweep_slices(
         own = views.prepared if asked.axis_col is None or not of_axes else _about(views.prepared, asked)
         made = swept_slice(options, own, Grid.matching(views.prepared.geometry), sink, clock)
         assert own.held_out is not None
-        projected = Projector(own.held_out[1], made.volume.grid).forward(np.asarray(made.volume.data))
+        projector = Projector(own.held_out[1], made.volume.grid)
+        projected = projector.forward(np.asarray(made.volume.data))
         image = np.array(made.volume.data[made.volume.data.shape[0] // 2])
-        yield SweptSlice(values, image, made.seconds, views, projected)
+        yield SweptSlice(values, image, made.seconds, views, projected, projector.resolution)
         progress(n, len(trials))
 
 
@@ -214,19 +223,20 @@ def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
         common = np.intersect1d(common, each.views.ids)
     if len(shapes) > 1 or not common.size:
         return None
-    judges = list({id(each.views): each.views for each in slices}.values())
+    judges = {id(each.views): each for each in reversed(slices)}.values()  # one resolution for all geometries
     residuals = np.zeros((len(slices), common.size))
     scale, alike, first = 0.0, True, slices[0].views
     for judge in judges:
-        measured = judge.data[np.searchsorted(judge.ids, common)]
-        scale += float(np.sqrt(np.nanmean(np.square(measured, dtype=np.float64))))
+        at = np.searchsorted(judge.views.ids, common)
+        measured, resolution = judge.views.data[at], judge.resolution.select(at)
+        if not np.isfinite(measured).any(axis=(1, 2)).all():
+            return None
         alike &= np.array_equal(measured, first.data[np.searchsorted(first.ids, common)], equal_nan=True)
         for n, each in enumerate(slices):
-            differences = each.projected[np.searchsorted(each.views.ids, common)] - measured
-            by_view = residuals_by_view(differences, measured, each.views.prepared.geometry)
-            if by_view.size != common.size:
-                return None
-            residuals[n] += by_view
+            model = each.projected[np.searchsorted(each.views.ids, common)]
+            left, own = squares_left(model, measured, resolution)
+            residuals[n] += np.sqrt(left)
+        scale += float(np.sqrt(own.mean()))
     if scale == 0:
         raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
     return Scores(residuals / scale, alike)

@@ -51,4 +51,4 @@ def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, c
     from beamline.features.tango.device import ServerPlace, serve
 
     place = ServerPlace(bind, port, device, instance)
-    serve(runs, place, control, say, lambda: click.echo(f"{place} (docs/tango.md). Ctrl-C ends this, not the scan."))
+    serve(runs, place, control, say, lambda: click.echo(f"{place} (docs/page.md). Ctrl-C ends this, not the scan."))

@@ -21,7 +21,7 @@ from beamline.scan.states import State
 
 Picture = NDArray[np.float32]
 SHOWN = [each for each in fields(RunValues) if each.name not in ("data_rate", "residual", "skipped")]
-"""The values of a run that are attributes of the device, by the names of the process variables (docs/epics.md)."""
+"""The values of a run that are attributes of the device, by the names of the process variables (docs/page.md)."""
 _RAISED = {"warnings": "ATTR_WARNING", "alarms": "ATTR_ALARM"}
 
 

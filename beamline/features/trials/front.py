@@ -45,7 +45,7 @@ _FIGURES = {
     "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", _digits("spillover")),
     "variation": _Figure("noise", "noise", "standard deviation of the body over its level", _digits("variation")),
     "residual_held_out": _Figure(
-        "held out", "held-out res.", "residual of views held out", _digits("residual_held_out")
+        "held out", "held-out res.", METRICS["residual_held_out"].label, _digits("residual_held_out")
     ),
     "resolution": _Figure("FSC", "FSC ({})", "period in {} to which two halves of the views agree", _period),
 }

@@ -150,7 +150,7 @@ def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: Sli
 
 
 def to_html(table: TrialTable, layout: TableLayout, pictures: Sequence[Picture]) -> str:
-    """The page."""
+    """The table and its pictures as an HTML page."""
     columns, marked = [column for column in layout.columns(table) if column.heading], layout.marked(table)
     counts = f"{table.n_done} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(

@@ -77,7 +77,7 @@ class OpenedScan:
 
 
 def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
-    """Read and correct the views. What is refused is refused first.
+    """Read and correct the views, after all inputs were checked.
 
     Raises:
         ConfigError, DataError: nothing was written.

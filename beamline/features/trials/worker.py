@@ -32,6 +32,7 @@ from beamline.core.process import at_end_of
 from beamline.features.trials.data import TrialData, VolumeAt, averaged, by_parts, write_array
 from beamline.features.trials.trial import Trial
 from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import binned, run_on
 from beamline.report.record import history_arrays, residual_curve
 from recon.assess import metrics
@@ -44,6 +45,7 @@ from recon.base.volume import Grid, Volume
 from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
+from recon.voxels.resolution import Resolution
 from recon.warm_up import warm_up
 
 Say = Callable[[Mapping[str, Any]], None]
@@ -125,13 +127,18 @@ def measured(
         figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
     if data.prepared.held_out is not None:
         unseen, geometry = data.prepared.held_out
-        root = np.float32(1) if (rays := data.rays_held_out) is None else np.sqrt(rays)
+        rays = data.rays_held_out
         of_view = np.zeros(geometry.n_views) if data.shown_held_out is None else data.shown_held_out
-        off = root * (shown(volume_at, of_view, geometry, grid) - unseen)
-        if (scale := float(np.linalg.norm(root * unseen))) == 0:
+        left, own = squares_left(
+            shown(volume_at, of_view, geometry, grid),
+            unseen,
+            Resolution.of(geometry, grid),
+            None if rays is None else np.asarray(rays > 0),
+        )
+        if not own.any():
             raise ValueError("the views held out are all zero, so there is nothing to explain")
-        figures["residual_held_out"] = float(np.linalg.norm(off)) / scale
-        squared = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
+        figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
+        squared = left.tolist()
     return figures, squared
 
 

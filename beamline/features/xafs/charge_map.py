@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
@@ -23,7 +22,7 @@ from beamline.core.text import size
 from beamline.core.voxel_kind import VoxelKind
 from beamline.energies.spectra import Spectra
 from beamline.reconstruct.memory import SHARE
-from beamline.report.figures import downwards, dpi_for, planes, png
+from beamline.report.figures import downwards, dpi_for, new_figure, planes, png
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.files import opened_volume
@@ -192,7 +191,7 @@ def picture(charge: ChargeMap) -> bytes:
     at = [int(filled.sum(axis=tuple({0, 1, 2} - {axis})).argmax()) for axis in range(3)]
     images = (volume.data[at[0]], volume.data[:, at[1]], volume.data[:, :, at[2]])
     height = max(volume.grid.shape[1] / volume.grid.shape[2], volume.grid.shape[0] / volume.grid.shape[2], 0.3)
-    figure = Figure(figsize=(11, 2.6 * height + 3.2), dpi=dpi_for(volume.grid.shape[2], 3.0), layout="constrained")
+    figure = new_figure((11, 2.6 * height + 3.2), dpi_for(volume.grid.shape[2], 3.0))
     upper, lower = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(2.6 * height + 0.8, 2.4))))
     panels = np.ravel(np.asarray(upper.subplots(1, 3)))
     for axis, (axes, image, plane) in enumerate(zip(panels, images, planes(volume.grid), strict=True)):

@@ -14,7 +14,7 @@ import numpy as np
 from beamline.core.files import refuse_existing, write_whole
 from beamline.features.xafs.contrast import XafsCurve
 from beamline.features.xafs.edge import AbsorptionEdge
-from beamline.report.figures import png
+from beamline.report.figures import WIDTH, new_figure, png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,10 +124,8 @@ def table(curve: XafsCurve) -> str:
 
 def picture(result: XafsResult) -> bytes:
     """PNG: the absorption over energy with edge, white line and best energy, and the contrast-to-noise below."""
-    from matplotlib.figure import Figure
-
     curve, edge, cnr = result.curve, result.edge, result.curve.contrast_to_noise
-    figure = Figure(figsize=(8.6, 3.4 if cnr is None else 5.4), dpi=110, layout="constrained")
+    figure = new_figure((WIDTH, 3.4 if cnr is None else 5.4))
     panels: list[Axes] = list(np.ravel(np.asarray(figure.subplots(1 if cnr is None else 2, 1, sharex=True))))
     top = panels[0]
     top.plot(curve.energies, curve.absorption, color="0.25", lw=1.2, marker=".", ms=3)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from beamline.features.xafs.results import XafsResult
-from beamline.report.figures import png
+from beamline.report.figures import one_panel, png
 
 _COLOURS = "viridis"
 _MOST_LABELS = 12  # in a legend; more colours nobody tells apart
@@ -53,10 +53,8 @@ def table(states: Sequence[XafsResult]) -> str:
 def picture(states: Sequence[XafsResult]) -> bytes:
     """PNG: all curves over energy, and the edge (dashed) and the white line (dotted) of each in its colour."""
     from matplotlib import colormaps
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.6, 4.6), dpi=110, layout="constrained")
-    axes = figure.subplots()
+    figure, axes = one_panel(4.6)
     shades = np.linspace(0, 0.9, len(states))
     named = set(np.linspace(0, len(states) - 1, _MOST_LABELS).round().astype(int))
     for n, (state, shade) in enumerate(zip(states, shades, strict=True)):

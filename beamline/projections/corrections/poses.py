@@ -158,7 +158,7 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     tilt = selection.step(TiltAndLens)
     if tilt.sought or tilt.tilt_deg:
         raise ConfigError(
-            f"--tilt turns views that {table.path} states as they were taken: write it to the roll_deg of --poses."
+            f"--tilt and --poses both set the roll of the views. Add the tilt to the column roll_deg of {table.path}."
         )
     for learns in (step.asked_by for step in geometry_steps(selection) if step.geometry):
         raise ConfigError(

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from beamline.storage.rules.references import ReferenceGroups
     from recon.prep.correct import References
 
+_STEADY = 0.01  # of the ring current: top-up keeps it so
+
 
 @dataclass(frozen=True)
 class ReferenceCheck:
@@ -95,30 +97,56 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
     """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
 
     Frames that are damaged (see ScanSource) are left out, unless the selection uses all. The light of flats with an
-    exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat, where both are known. The
-    dark is one for all: the file's rules tell where it was exposed otherwise.
+    exposure of their own is scaled to the projections': dark + (flat - its dark) * t / t_flat, where both are known.
+    Of darks of several exposures each kind of frame has its own, see `recon.prep.references.dark_at`.
 
     Raises:
         DataError: all frames of a kind are damaged.
     """
     from beamline.projections.read import spoilt_frames
+    from beamline.storage.rules.exposures import usual_exposure
     from recon.prep.correct import References
 
     binning, use_damaged = selection.binning, not selection.step(Flags).used
-    dark = _mean(source, np.concatenate(groups.darks), rows, binning, None, use_damaged)
+    darks = _darks(source, np.concatenate(groups.darks), rows, binning, use_damaged)
+    dark = _dark_of(usual_exposure(source), darks)
     scale = light_scale(source, use_current(selection))
     flats = []
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
         if dark is not None and mean is not None:
             used = np.setdiff1d(group, spoilt_frames(source, use_damaged))
-            flats.append((float(used.mean()), (mean + (1 - scale[used].mean()) * dark).astype(np.float32)))
+            own, light = _dark_of(float(np.median(source.exposures[used])), darks), scale[used].mean()
+            net = (1 - light) * dark if own is dark or own is None else dark - light * own
+            flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
             f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are not "
             "what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
         )
     return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
+
+
+def _darks(
+    source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int, use_damaged: bool
+) -> list[tuple[float, NDArray[np.float64]]]:
+    """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
+    from beamline.storage.rules.exposures import by_exposure
+
+    means = [
+        (seconds, _mean(source, some, rows, binning, None, use_damaged))
+        for seconds, some in by_exposure(source, frames)
+    ]
+    return [(seconds, mean) for seconds, mean in means if mean is not None]
+
+
+def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
+    """That of an exposure; the mean of all where it is unknown. None without darks."""
+    from recon.prep.references import dark_at
+
+    if len(darks) < 2:
+        return darks[0][1] if darks else None
+    return dark_at(exposure, darks) if exposure > 0 else np.asarray(np.mean([dark for _, dark in darks], axis=0))
 
 
 def with_dynamic_flats(
@@ -136,11 +164,13 @@ def with_dynamic_flats(
     frames = np.concatenate(groups.flats)
     frames = np.setdiff1d(frames, spoilt_frames(source, not selection.step(Flags).used))
     scale = light_scale(source, use_current(selection))
+    darks = _darks(source, np.concatenate(groups.darks), rows, selection.binning, not selection.step(Flags).used)
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame in frames:
             image = read_binned(source, np.array([frame]), rows, selection.binning)[0]
-            yield ((image - references.dark) * np.float32(scale[frame])).astype(np.float32)
+            dark = references.dark if len(darks) < 2 else _dark_of(float(source.exposures[frame]), darks)
+            yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.step(Defects).hot_threshold)
     try:
@@ -151,10 +181,8 @@ def with_dynamic_flats(
 
 
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
-    """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
-
-    If projections differ, the median counts. With `by_current` also from its own ring current.
-    """
+    """By how much the light of each frame grows from its own exposure to the projections' median; 1 where one is
+    unknown. With `by_current` also from its own ring current."""
     scale = _to_median(source.exposures, source.image_key)
     return scale * current_scale(source) if by_current else scale
 
@@ -166,6 +194,13 @@ def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDA
     if views.size == 0:
         return np.ones(values.size)
     return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+
+
+def view_scale(source: ScanSource, by_current: bool) -> NDArray[np.float64] | None:
+    """`light_scale` of views; None where they are all exposed alike, and nobody asked for the ring current."""
+    from beamline.storage.rules.exposures import views_differ
+
+    return light_scale(source, by_current) if by_current or views_differ(source) else None
 
 
 def use_current(selection: Selection) -> bool:
@@ -185,6 +220,20 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
         lacking = "no ring current" if currents is None else "no ring current for some views or flats"
         raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
     return _to_median(currents, source.image_key)
+
+
+def uncorrected_current(source: ScanSource, selection: Selection) -> str:
+    """A warning where the ring current changed between flats and views and nobody asked to correct it; "" if not."""
+    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
+    if source.quantity != "counts" or use_current(selection) or (known := source.currents) is None:
+        return ""
+    currents = known[used]
+    if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
+        return ""
+    return (
+        f"The ring current of flats and views (control/data) varies from {currents.min():.6g} to {currents.max():.6g}, "
+        f"{currents.max() / currents.min() - 1:.0%}, and no air beside the sample corrects it: say --ring-current use."
+    )
 
 
 def _mean(
@@ -207,11 +256,16 @@ def _mean(
     return total / n if n else None
 
 
-def flats_sentence(source: ScanSource, references: References, current_factor: NDArray[np.float64] | None) -> str:
-    """What was done about changes of the beam, in words; empty where nothing was asked."""
+def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
+    """What was done about changes of the beam and of the exposure, in words; empty where nothing was."""
+    from beamline.storage.rules.exposures import views_differ
+
     sentences = []
-    if current_factor is not None:
-        currents = 1 / current_factor[source.image_key == FrameKind.PROJECTION]
+    if views_differ(source):
+        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        sentences.append(f"Exposures of the views: {views.min():g} to {views.max():g} s; corrected.")
+    if by_current:
+        currents = 1 / current_scale(source)[source.image_key == FrameKind.PROJECTION]
         sentences.append(
             f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
         )

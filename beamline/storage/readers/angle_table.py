@@ -48,7 +48,7 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
     first = int(match[1] or 0)
     last = int(match[2] or angles.size)
     if not 0 <= first < last <= angles.size:
-        raise DataError(f"--angle-rows {rows} does not lie within the {angles.size} angles that there are.")
+        raise DataError(f"--angle-rows {rows} is out of range: the file has {angles.size} angles.")
     return angles[first:last]
 
 

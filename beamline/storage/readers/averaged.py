@@ -147,6 +147,11 @@ class AveragedSource(WrappedSource):
         return None if currents is None else self._mean(currents)
 
     @property
+    def energies(self) -> NDArray[np.float64] | None:
+        energies = self._base.energies
+        return None if energies is None else self._mean(energies)
+
+    @property
     def times(self) -> NDArray[np.float64] | None:
         times = self._base.times
         return None if times is None else self._mean(times)

@@ -37,6 +37,14 @@ class NotUsed(NamedTuple):
     doubt: bool
 
 
+class Used(NamedTuple):
+    """A field that a file states and that is used: where it is, its value, what for."""
+
+    where: str
+    value: str
+    use: str
+
+
 class EmissionCounts(NamedTuple):
     """Float32 [view, row, col] each: what was counted, and survival and background as of `recon.Emission`."""
 
@@ -135,6 +143,11 @@ class ScanSource(ABC):
         return ()
 
     @property
+    def used(self) -> tuple[Used, ...]:
+        """What the file states of each frame, and of exposure, current, energy and geometry, and what is used."""
+        return ()
+
+    @property
     def flags(self) -> FrameFlags | None:
         """Of the monitor, by frame; None where no monitor looked at the frames."""
         return None
@@ -145,6 +158,11 @@ class ScanSource(ABC):
 
         NaN where unknown; None where there is no monitor.
         """
+        return None
+
+    @property
+    def energies(self) -> NDArray[np.float64] | None:
+        """float64 [frame] keV, NaN where unknown; None where the file states none of each frame."""
         return None
 
     @property

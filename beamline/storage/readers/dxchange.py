@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
+from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, Used, frame_indices
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from beamline.storage.readers.stated import EXCHANGE, EXCHANGE_ENERGY_UNITS, EXCHANGE_LENGTH_UNITS, not_copied, not_used
+from beamline.storage.readers.stated import (
+    EXCHANGE,
+    EXCHANGE_ENERGY_UNITS,
+    EXCHANGE_LENGTH_UNITS,
+    EXCHANGE_TIME_UNITS,
+    in_use,
+    not_copied,
+    not_used,
+    unknown_fields,
+)
 from beamline.storage.readers.turned import TurnedFrames, dimensions
 from drivers.base.frame import FrameKind
 
 _USUAL = (0, 1, 2)
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
 _DETECTOR = "measurement/instrument/detector"
+_FLATS = "process/acquisition/flat_fields"
 _ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
 _ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)  # keV and mm of a detector, of numbers without a unit
 TEXTS = {"title": "exchange/title", "sample": "measurement/sample/name"}
@@ -45,13 +56,17 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             if item is not None
         ]
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
+        n_views = len(stacks[-1].frames)
         if own_angles:
-            n_views = len(stacks[-1].frames)
             source.angles[-n_views:] = _theta(file, n_views)
+        source.take_order(_thetas(file, stacks))
+        _set_exposures(source, file)
         units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
         source.stated = not_copied(file, TEXTS.values()) + not_used(EXCHANGE, file, source)
+        source.stated += unknown_fields(EXCHANGE, file, source)
+        source.in_use = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
             source.stated += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
@@ -62,13 +77,93 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 class ExchangeSource(StacksSource):
-    """A scan as Data Exchange; `stated` are the fields that are not used."""
+    """A scan as Data Exchange; `stated` are the fields that are not used, `in_use` those that are."""
 
     stated: tuple[NotUsed, ...] = ()
+    in_use: tuple[Used, ...] = ()
+    _of_stack: NDArray[np.int64] | None = None
+    """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
+
+    def take_order(self, thetas: Sequence[NDArray[np.float64] | None]) -> None:
+        """Put darks and flats among the views by the angles at which they were taken, where the file states them.
+
+        Args:
+            thetas: radians of the darks and of the flats; None where the file states none.
+        """
+        views = self.angles[self.image_key == FrameKind.PROJECTION]
+        known = [theta for theta in thetas if theta is not None]
+        steps = np.diff(views)
+        if not known or len(known) < len(thetas) or not ((steps > 0).all() or (steps < 0).all()):
+            return
+        at = np.concatenate([np.abs(views - theta[:, None]).argmin(axis=1) for theta in known])
+        after = at == views.size - 1  # those of the end
+        place = np.concatenate([np.where(after, views.size, at - 0.5), np.arange(views.size)])
+        self._of_stack = np.argsort(place, kind="stable")
+        for name in ("image_key", "angles", "exposures"):
+            setattr(self, name, getattr(self, name)[self._of_stack])
+        self.in_order = True
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        if self._of_stack is None:
+            return super().read(frames, rows)
+        return super().read(self._of_stack[frame_indices(frames, self.image_key.size)], rows)
 
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
         return self.stated
+
+    @property
+    def used(self) -> tuple[Used, ...]:
+        return self.in_use
+
+
+def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> list[NDArray[np.float64] | None]:
+    """Radians at which the frames of each stack of references were taken; None where the file does not state them."""
+    names = {FrameKind.DARK: "exchange/theta_dark", FrameKind.FLAT: "exchange/theta_white"}
+    return [_list(file, names[stack.kind], len(stack.frames)) for stack in stacks if stack.kind in names]
+
+
+def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
+    """Radians of each of so many frames; None where the file has no such list."""
+    item = hdf5.dataset(file, where)
+    if item is None or item.size != n or item.dtype.kind not in "uif":
+        return None
+    angles = hdf5.radians(item, default="degrees")
+    return angles if np.isfinite(angles).all() else None
+
+
+def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
+    """Of all frames, or of each view; and of flats, where the acquisition says that they have one of their own."""
+    views = source.image_key == FrameKind.PROJECTION
+    seconds = _seconds(file, f"{_DETECTOR}/exposure_time", int(views.sum()))
+    if seconds is None:
+        return
+    source.exposures[views] = seconds
+    source.exposures[~views] = seconds[0] if seconds.size == 1 else np.nan
+    how = hdf5.dataset(file, f"{_FLATS}/different_flat_exposure")
+    of_flats = _seconds(file, f"{_FLATS}/flat_exposure_time", 1)
+    if of_flats is not None and how is not None and _words(how).lower().startswith("different"):
+        source.exposures[source.image_key == FrameKind.FLAT] = of_flats
+
+
+def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
+    """Positive times, one or so many; None where the file has no such, or in an unknown unit."""
+    item = hdf5.dataset(file, where)
+    if item is None or item.size not in (1, n) or item.dtype.kind not in "uif":
+        return None
+    factor = EXCHANGE_TIME_UNITS.get(hdf5.attribute(item, "units").lower(), np.nan)
+    values = np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
+    return values if (values > 0).all() else None
+
+
+def _words(item: h5py.Dataset) -> str:
+    """A text, also where an area detector writes its characters as numbers."""
+    values = np.ravel(hdf5.values_of(item))
+    return (
+        values.astype(np.uint8).tobytes().decode("ascii", "replace").strip("\0 ")
+        if values.dtype.kind in "ui"
+        else (hdf5.text_of(item))
+    )
 
 
 def _axes(item: h5py.Dataset) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
@@ -199,24 +200,33 @@ def require_order(places: Places) -> None:
 
 def read_energy(entry: h5py.Group) -> float | None:
     """Of the photons in keV, by an energy or a wavelength of the beam or the monochromator; None for a spectrum."""
+    values = _energies(entry, 1)
+    return None if values is None or not np.isfinite(values[0]) else float(values[0])
+
+
+def read_energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
+    """float64 [n] keV of each frame; None where the file has no such list."""
+    values = _energies(entry, n) if n > 1 else None
+    return None if values is None or not np.isfinite(values).any() else values
+
+
+def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
+    """So many energies in keV from the first place that has them in a known unit."""
     for energy, wavelength, groups_ in (
         ("incident_energy", "incident_wavelength", _BEAMS),
         ("energy", "wavelength", (_MONOCHROMATOR,)),
     ):
-        for where in groups_:
-            kev = _one(entry, f"{where}/{energy}", hdf5.ENERGY_UNITS)
-            if kev is not None:
-                return kev
-        for where in groups_:
-            angstrom = _one(entry, f"{where}/{wavelength}", hdf5.WAVELENGTH_UNITS)
-            if angstrom is not None and angstrom > 0:
-                return _HC / angstrom
+        for name, units, angstrom in ((energy, hdf5.ENERGY_UNITS, False), (wavelength, hdf5.WAVELENGTH_UNITS, True)):
+            for where in groups_:
+                item = hdf5.dataset(entry, f"{where}/{name}")
+                factor = None if item is None else units.get(hdf5.attribute(item, "units").lower())
+                if item is None or factor is None or item.size != n or item.dtype.kind not in "uif":
+                    continue
+                values = np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
+                values = np.where(values > 0, values, np.nan)
+                if np.isfinite(values).any():
+                    return _HC / values if angstrom else values
     return None
-
-
-def _one(entry: h5py.Group, path: str, units: dict[str, float]) -> float | None:
-    item = hdf5.dataset(entry, path)
-    return None if item is None or item.size != 1 else hdf5.scalar(entry, path, units)
 
 
 def _source_distance(entry: h5py.Group) -> float | None:

@@ -28,12 +28,22 @@ from beamline.storage.readers.base import (
     Quantity,
     ScanFormat,
     ScanSource,
+    Used,
     count_in_blocks,
     frame_indices,
     read_known,
 )
-from beamline.storage.readers.nexus import choose, differing, find, read_energy, read_geometry, require_order
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_copied, not_used
+from beamline.storage.readers.nexus import (
+    Places,
+    choose,
+    differing,
+    find,
+    read_energies,
+    read_energy,
+    read_geometry,
+    require_order,
+)
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, not_used, unknown_fields
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
@@ -52,7 +62,8 @@ class NXtomoSource(ScanSource):
         self.path = path
         self._file = hdf5.open_hdf5(path, follow)
         try:
-            self._places = places = choose(self._file, find(self._file), data)
+            found = find(self._file)
+            self._places = places = choose(self._file, found, data)
             self._ours = layout.COMMITTED in self._file
             self._check()
             shape = places.data.shape
@@ -79,7 +90,9 @@ class NXtomoSource(ScanSource):
             self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
-            self._not_used = self._find_not_used()
+            self._not_used = self._find_not_used(found if data is None else [])
+            self._used = self._find_used()
+            self._energies = None if self._ours else read_energies(places.entry, self.n)
         except BaseException:
             self._file.close()
             raise
@@ -216,17 +229,37 @@ class NXtomoSource(ScanSource):
             ending = ending_in(self._file)
             return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
-    def _find_not_used(self) -> tuple[NotUsed, ...]:
+    def _find_not_used(self, found: list[Places]) -> tuple[NotUsed, ...]:
         outside = not_copied(self._places.entry, TEXTS.values())
         if self._geometry is None:
             return outside
-        fields = outside + not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        detector = str(self._places.detector.name)
+        fields = outside + not_used(NXTOMO, self._places.entry, self, detector)
+        fields += unknown_fields(NXTOMO, self._places.entry, self, detector)
+        for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
+            shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
+            fields += (
+                NotUsed(where, f"{shape} frames", f"it is another scan of this file: --data-path {where}", True),
+            )
         turned = self._geometry.turned
         return (*fields, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else fields
+
+    def _find_used(self) -> tuple[Used, ...]:
+        if self._geometry is None:
+            return ()
+        return in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
 
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
         return self._not_used
+
+    @property
+    def used(self) -> tuple[Used, ...]:
+        return self._used
+
+    @property
+    def energies(self) -> NDArray[np.float64] | None:
+        return self._energies
 
     @property
     def flags(self) -> FrameFlags | None:

@@ -94,15 +94,21 @@ class OverlaidSource(WrappedSource):
         starts = self._base.part_starts
         return np.where(starts > 0, starts + len(self._front), 0)
 
-    @property
-    def currents(self) -> NDArray[np.float64] | None:
-        known = self._base.currents
+    def _behind(self, known: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        """Values [frame] of `base`, NaN for the references in front."""
         return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
 
     @property
+    def currents(self) -> NDArray[np.float64] | None:
+        return self._behind(self._base.currents)
+
+    @property
+    def energies(self) -> NDArray[np.float64] | None:
+        return self._behind(self._base.energies)
+
+    @property
     def times(self) -> NDArray[np.float64] | None:
-        known = self._base.times
-        return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
+        return self._behind(self._base.times)
 
     @property
     def shifts(self) -> NDArray[np.float64] | None:

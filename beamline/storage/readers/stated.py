@@ -6,6 +6,7 @@ and that nobody uses; `info` shows them, and `validate` warns where such a value
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import printable
 from beamline.storage import hdf5
-from beamline.storage.readers.base import NotUsed, ScanSource
+from beamline.storage.readers.base import NotUsed, ScanSource, Used
 from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
@@ -29,6 +30,11 @@ EXCHANGE_ENERGY_UNITS = {
     "joule": 1 / 1.602176634e-16,
     "": 1 / 1.602176634e-16,
 }
+EXCHANGE_TIME_UNITS = {**hdf5.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
+_UNKNOWN = "nothing reads this name"
+_MOST = 40  # fields of unknown names
+_CHANGES = re.compile(r"expos|count_?time|current|energ|wavelength|shift|transl|displac|jitter")
+_TOLD = re.compile(_CHANGES.pattern + r"|position|temperature")
 _HALF_PIXEL = 0.5  # what moves by less is not seen
 
 
@@ -72,6 +78,49 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
             unused.append(NotUsed(field.where, _text(value, unit), why, True))
     return tuple(unused)
+
+
+def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
+    """The numbers that a file states and that are used."""
+    unused, used = {field.where for field in source.not_used}, []
+    for field in fields:
+        item = _dataset(root, field.where, detector) if field.used and field.where not in unused else None
+        if item is not None and item.dtype.kind in "uif" and item.ndim <= 1 and 0 < item.size * 8 <= hdf5.BRIEF:
+            text = _text(np.asarray(hdf5.values_of(item)), hdf5.attribute(item, "units"))
+            used.append(Used(field.where, text, field.use))
+    return tuple(used)
+
+
+def unknown_fields(
+    fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = ""
+) -> tuple[NotUsed, ...]:
+    """What a file states of each frame, and of exposure, current, energy, position and temperature, under other names.
+
+    A doubt where what may change line integrals differs from view to view.
+    """
+    listed = [item for field in fields if (item := _dataset(root, field.where, detector)) is not None]
+    places, views = {_place(item) for item in listed}, source.image_key == FrameKind.PROJECTION
+    unknown = list[NotUsed]()
+
+    def visit(name: str, item: Any) -> None:
+        told = [key for key in item.attrs if _TOLD.search(key.lower()) and not key.endswith("_indices")]
+        unknown.extend(NotUsed(f"{name}@{key}", hdf5.attribute(item, key), _UNKNOWN, False) for key in told)
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or _place(item) in places:
+            return
+        of_frames = item.ndim == 1 and item.size in (views.size, views.sum()) and item.size > 1
+        if of_frames or (item.size == 1 and _TOLD.search(name.rpartition("/")[2].lower())):
+            value = np.asarray(hdf5.values_of(item))
+            of_views = value[views] if value.size == views.size else value
+            doubt = of_frames and bool(_CHANGES.search(name.lower())) and np.unique(of_views).size > 1
+            unknown.append(NotUsed(name, _text(value, hdf5.attribute(item, "units")), _UNKNOWN, doubt))
+
+    root.visititems(visit)
+    return tuple(unknown[:_MOST])
+
+
+def _place(item: h5py.Dataset) -> tuple[int, int]:
+    known = h5py.h5o.get_info(item.id)
+    return known.fileno, known.addr
 
 
 def not_copied(root: h5py.Group, texts: Iterable[str]) -> tuple[NotUsed, ...]:
@@ -187,7 +236,7 @@ NXTOMO: tuple[Entry, ...] = (
     Entry("start_time", "shown"),
     Entry("end_time", "shown"),
     Entry("instrument/name", "shown"),
-    Entry("control/data", "ring current of each frame, or another monitor of the beam"),
+    Entry("control/data", "ring current of each frame, or another monitor of the beam: --ring-current use"),
     Entry("instrument/beam/incident_energy", "energy", units=hdf5.ENERGY_UNITS),
     Entry("beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
     Entry("sample/beam/incident_energy", _ENERGY, units=hdf5.ENERGY_UNITS),
@@ -260,8 +309,8 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
     Entry("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
     Entry("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
-    Entry("exchange/theta_white", "the order of flats among the views is not used", False),
-    Entry("exchange/theta_dark", "the order of darks among the views is not used", False),
+    Entry("exchange/theta_white", "where flats stand among the views, which then have the flats around them"),
+    Entry("exchange/theta_dark", "where darks stand among the views"),
     Entry("exchange/data_shift_x", _POSES, False, _shifts),
     Entry("exchange/data_shift_y", _POSES, False, _shifts),
     Entry("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
@@ -269,8 +318,16 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
     Entry("measurement/instrument/source/current", "one value for the whole scan", False),
     Entry(
-        "measurement/instrument/detector/exposure_time", "flats and darks are taken to be exposed as the views", False
+        "measurement/instrument/detector/exposure_time",
+        "exposure of darks, flats and views, or of each view; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
     ),
+    Entry(
+        "process/acquisition/flat_fields/flat_exposure_time",
+        "exposure of flats, where different_flat_exposure says that it is another; seconds without units",
+        units=EXCHANGE_TIME_UNITS,
+    ),
+    Entry("process/acquisition/flat_fields/different_flat_exposure", "Different: flats have flat_exposure_time"),
     Entry("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
     Entry("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
     Entry("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),

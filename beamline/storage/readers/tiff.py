@@ -6,9 +6,7 @@ import logging
 import lzma
 import math
 import re
-import struct
 import zipfile
-import zlib
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,15 +16,12 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.storage.hdf5 import ALTERED
 from beamline.storage.header import PACKED
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-UNREADABLE = (
-    *(OSError, ValueError, LookupError, ArithmeticError, TypeError, AttributeError, AssertionError, EOFError),
-    *(RuntimeError, MemoryError, ImportError, struct.error, zlib.error, lzma.LZMAError),
-    *(tifffile.TiffFileError, zipfile.BadZipFile),
-)
+UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile)
 """What tifffile, zipfile and their decoders raise for a file that they cannot read; none of ours is among them."""
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 

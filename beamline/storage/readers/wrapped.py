@@ -145,25 +145,25 @@ class TurnedSource(WrappedSource):
 
 
 class KeyedSource(WrappedSource):
-    """A ScanSource whose frames are of the kinds that a caller says."""
+    """A ScanSource whose frames are of the kinds that a caller says, or those of one energy."""
 
     def __init__(self, base: ScanSource, kinds: str) -> None:
         """Take `kinds` such as "darks=0:5,flats=5:10+95:100,views=10:95": rows of the scan, ends not included.
 
-        Without views all other frames are projections, else invalid.
+        Without views all other frames are projections, else invalid. "energy=20" makes frames of other energies
+        invalid, by the file.
 
         Raises:
-            DataError: they are no such text, or lie outside the scan.
+            DataError: they are no such text, lie outside the scan, or the file states no such energy.
         """
         super().__init__(base)
-        n = int(base.image_key.size)
-        stated, named = np.full(n, -1), _ranges(kinds, n)
-        for kind, first, end in named:
-            if (stated[first:end] >= 0).any():
-                raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
-            stated[first:end] = kind
-        others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
-        self._keys = np.where(stated < 0, others, stated).astype(np.int32)
+        words = [word.strip() for word in kinds.split(",")]
+        named = [word for word in words if not word.startswith(_ENERGY)]
+        self._keys = _stated_keys(",".join(named), int(base.image_key.size)) if named else base.image_key.copy()
+        for word in words:
+            if word.startswith(_ENERGY):
+                self.energy_kev, others = _of_one_energy(base, word)
+                self._keys[others] = FrameKind.INVALID
         if base.quantity == "unknown" and base.dtype.kind in "ui" and {*self._keys.tolist()} >= {1, 2}:
             self.quantity = "counts"
         self._update()
@@ -176,6 +176,50 @@ class KeyedSource(WrappedSource):
         return self._base.read(frames, rows)
 
 
+def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
+    """The kind of each of n frames by what the caller says."""
+    stated, named = np.full(n, -1), _ranges(kinds, n)
+    for kind, first, end in named:
+        if (stated[first:end] >= 0).any():
+            raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
+        stated[first:end] = kind
+    others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
+    return np.where(stated < 0, others, stated).astype(np.int32)
+
+
+def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:
+    """keV of "energy=20", and the frames of other energies."""
+    try:
+        kev = float(word.removeprefix(_ENERGY))
+    except ValueError:
+        raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
+    known = source.energies
+    if known is None:
+        raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
+    others = np.abs(known - kev) > _SAME_ENERGY * kev
+    if not (np.isfinite(known) & ~others).any():
+        raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
+    return kev, others
+
+
+def in_words(energies: NDArray[np.float64]) -> str:
+    """How many frames have which energy, such as "45 at 20 keV and 45 at 30 keV"."""
+    parts = of_energies(energies)
+    listed = [f"{n} at {kev:.6g} keV" for kev, n in parts[:_LISTED]]
+    listed += [f"and more up to {parts[-1][0]:.6g} keV"] if len(parts) > _LISTED else []
+    return ", ".join(listed)
+
+
+def of_energies(energies: NDArray[np.float64]) -> list[tuple[float, int]]:
+    """(keV, number of frames) of each energy; what differs by a part in ten thousand is one."""
+    known = np.sort(energies[np.isfinite(energies)])
+    parts = np.split(known, np.flatnonzero(np.diff(known) > _SAME_ENERGY * known[:-1]) + 1)
+    return [(float(np.median(part)), int(part.size)) for part in parts if part.size]
+
+
+_ENERGY = "energy="
+_SAME_ENERGY = 1e-4  # as a monochromator repeats one
+_LISTED = 6  # energies in a sentence
 _KINDS = {"darks": FrameKind.DARK, "flats": FrameKind.FLAT, "views": FrameKind.PROJECTION, "none": FrameKind.INVALID}
 
 
@@ -315,7 +359,7 @@ class PartsSource(WrappedSource):
         pairs = zip(self._sources, self._firsts[:-1], strict=True)
         return frozenset(int(row + first) for source, first in pairs for row in source.damaged)
 
-    currents, shifts = ScanSource.currents, ScanSource.shifts  # not told of parts
+    currents, energies, shifts = ScanSource.currents, ScanSource.energies, ScanSource.shifts  # not told of parts
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

@@ -18,13 +18,14 @@ from beamline.monitor.odd_references import without_odd
 from beamline.monitor.references import (
     BY_CHANCE,
     Group,
-    JudgedGroup,
+    GroupVerdict,
     ReferenceFrame,
     ReferenceLimits,
     full_scale,
     judge,
 )
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.exposures import levelled
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
@@ -50,7 +51,7 @@ class ReferenceGroups:
 
     darks: tuple[Frames, ...]
     flats: tuple[Frames, ...]
-    judged: tuple[JudgedGroup, ...]
+    judged: tuple[GroupVerdict, ...]
     alike: float | None = None
     brighter: float | None = None
 
@@ -60,7 +61,7 @@ class ReferenceGroups:
         dark_ok, flat_ok = ok[: len(self.darks)], ok[len(self.darks) :]
         return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
 
-    def lacking(self) -> tuple[JudgedGroup, ...]:
+    def lacking(self) -> tuple[GroupVerdict, ...]:
         """The groups of a kind where all are bad."""
         return tuple(
             group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
@@ -205,7 +206,7 @@ def some_of(group: Frames, most: int) -> Frames:
     return group[np.unique(np.linspace(0, group.size - 1, most).astype(int))]
 
 
-def _with_unread(source: ScanSource, judged: JudgedGroup, taken: Sequence[Frames]) -> JudgedGroup:
+def _with_unread(source: ScanSource, judged: GroupVerdict, taken: Sequence[Frames]) -> GroupVerdict:
     """The group with frames of its own that the file does not give: who reads them leaves them out, and names them."""
     own = next(group for group in taken if judged.rows[0] in group)
     return replace(judged, rows=tuple(sorted({*judged.rows, *own.tolist()} & {*judged.rows, *source.unreadable})))
@@ -222,7 +223,11 @@ _seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDiction
 
 
 def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
-    """Statistics of a frame of any kind, with its cells; it is read once."""
+    """Statistics of a frame of any kind, with its cells, as of one dark; it is read once."""
+    return levelled(source, _as_it_is(source, row), lambda other: _as_it_is(source, other))
+
+
+def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
     seen = _seen.setdefault(source, {})
     if row not in seen:
         seen[row] = look_at(read_known(source, [row])[0], row)

@@ -17,6 +17,7 @@ from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_jo
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.angle_order import angles_in_order
 from beamline.storage.rules.angles import angles_known, angles_seen, angles_spread
+from beamline.storage.rules.exposures import exposures_agree, one_energy
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import views_scaled
 from drivers.base.frame import FrameKind
@@ -27,7 +28,6 @@ SHAPES = 32  # views whose shape is looked at
 TURNED = 12  # views by which the direction of the axis is told
 _LEAST = 8  # views, rows and columns: fewer tell nothing of it
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
-EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
@@ -91,32 +91,6 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
                 f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
                 "say --quantity transmission, or line-integrals where their logarithm was taken.",
             )
-
-
-def exposures_agree(source: ScanSource) -> Iterator[Finding]:
-    """Darks are exposed as long as the projections, and the projections alike. Flats may have an exposure of their own,
-    for their light is scaled to the projections'."""
-    exposures = source.exposures
-    views = exposures[(source.image_key == FrameKind.PROJECTION) & np.isfinite(exposures)]
-    if source.quantity != "counts" or views.size == 0:
-        return
-    usual = float(np.median(views))
-    if np.ptp(views) > EXPOSURE_TOLERANCE * usual:
-        yield Finding(
-            "warning",
-            "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; they are all corrected as if for "
-            f"{usual:g} s.",
-        )
-    darks = np.unique(exposures[(source.image_key == FrameKind.DARK) & np.isfinite(exposures)])
-    if (np.abs(darks - usual) > EXPOSURE_TOLERANCE * usual).any():
-        seconds = ", ".join(f"{dark:g}" for dark in darks[:4])
-        yield Finding(
-            "warning",
-            "exposures",
-            f"The darks were exposed for {seconds} s and the projections for {usual:g} s: hot pixels and dark current "
-            "are not the same. Take darks with the projections' exposure.",
-        )
 
 
 def pixels_measured(source: ScanSource) -> Iterator[Finding]:
@@ -285,6 +259,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     quantity_stated,
     references_present,
     exposures_agree,
+    one_energy,
     pixels_measured,
     pixels_as_labelled,
     views_scaled,

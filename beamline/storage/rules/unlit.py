@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from beamline.monitor.flats_with_sample import lit_places
 from beamline.monitor.references import BRIGHT, ReferenceFrame
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, look_at, reference_frame, some_of
+from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, reference_frame, some_of
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, median_deviation
 
@@ -80,7 +80,7 @@ class ViewLight:
         same = bool(image.min() == image.max())
         if self.dark is None or self.flat is None:
             return same
-        bright = brightness(_cells_of(look_at(image, frame)), self.dark, self.flat)
+        bright = brightness(_cells(self.source, frame), self.dark, self.flat)
         return bright < LEAST * self.usual or (same and bool(np.ptp(self.flat) > 0))
 
 

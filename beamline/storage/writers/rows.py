@@ -83,11 +83,11 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
 
 
 def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
-    """ValueError where a row [row] is said to replace one that does not come before it, as in a circle; -1: none."""
+    """Raise ValueError where a row claims to replace itself or a later one. replaces: [row]; -1: none."""
     wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
     if wrong.size:
         row = int(wrong[0])
-        raise ValueError(f"row {row} is said to replace row {replaces[row]}, and only one before it can be replaced")
+        raise ValueError(f"row {row} claims to replace row {replaces[row]}; only an earlier row can be replaced")
 
 
 class Rows:

@@ -160,7 +160,7 @@ def learn_geometry(
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few; {LEAST_VIEWS} are needed")
     if not projections.any():
-        raise ValueError("the views show no matter")
+        raise ValueError("no absorbing sample in the views: all line integrals are 0")
     factors = _factors(*geometry.detector_shape)
     steps = _STEPS[: len(factors)]
     total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0

@@ -135,7 +135,7 @@ def _subsets(emission: Emission, grid: Grid, subsets: int) -> list[_Subset]:
         raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
     if not emission.counts.any():
         raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
-    whole, parts = Projector(emission.geometry, grid), []
+    whole, parts = Projector(emission.geometry, grid).plain, []  # expectation maximisation needs a matrix >= 0
     for some in interleaved(whole, subsets):
         projector = whole.subset(some)
         if emission.survival is None:
@@ -187,7 +187,7 @@ def passes_by_halves(
     half = Emission(kept, emission.geometry, survival, background)
     other = counts - kept if background is None else counts - kept - background
     lines = np.divide(other, survival, out=np.zeros_like(other), where=survival > 0)
-    whole, least, best = Projector(emission.geometry, grid), math.inf, 0
+    whole, least, best = Projector(emission.geometry, grid).plain, math.inf, 0
     for n, done in enumerate(islice(_passes(half, grid, subsets), most), start=1):
         missed = np.where(survival > 0, lines - whole.forward(done.activity), np.float32(0))
         error = _error_of_images(missed)

@@ -1,4 +1,4 @@
-"""spread: what a pixel takes from its neighbours, along columns and rows; its own transpose (numba, threaded)."""
+"""spread: what a pixel takes from its neighbours along columns and rows; its own transpose (numba, threaded)."""
 
 from __future__ import annotations
 
@@ -34,12 +34,13 @@ def _pass(lines: F32, shares: F32, out: F32) -> None:
             up, middle = middle, down
 
 
-def spread(lines: F32, along_cols: NDArray[np.float64], along_rows: float) -> F32:
-    """The lines [view, col, row] after passes of three neighbours each, of these variances in px² [view] and in all.
+def spread(lines: F32, along_cols: NDArray[np.float64], along_rows: NDArray[np.float64]) -> F32:
+    """The lines [view, col, row] after passes of three neighbours each, of these variances [view] in px².
 
+    A variance below zero takes so much away: views become sharper, by 1 - variance (1 - cos 2πf) at f cycles a pixel.
     A pixel at the edge takes from itself what lies beyond. The matrix is symmetric.
     """
-    passes = math.ceil(max(float(along_cols.max()), along_rows) / _MOST)
+    passes = math.ceil(float(max(np.abs(along_cols).max(), np.abs(along_rows).max())) / _MOST)
     if passes == 0:
         return lines
     shares = np.empty((len(lines), 2), np.float32)

@@ -53,7 +53,7 @@ def require(device: str | torch.device) -> torch.device:
         )
     if wanted.index not in (None, current):
         raise ValueError(
-            f"device {wanted} was asked for, and the GPU kernels run on the current one, cuda:{current}: start Python "
+            f"device {wanted} was requested, but GPU kernels run only on the current one, cuda:{current}: start Python "
             f"with CUDA_VISIBLE_DEVICES={wanted.index} and ask for cuda"
         )
     return wanted

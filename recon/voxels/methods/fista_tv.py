@@ -13,7 +13,7 @@ from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
-from recon.voxels.held_out import HeldOutTrial, choose_weight
+from recon.voxels.held_out import CHOICE_SWEEPS, HeldOutTrial, choose_weight
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista, subsets_of
@@ -48,6 +48,11 @@ class FistaTv:
     def __post_init__(self) -> None:
         check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 1}, least={"tv_weight": 0.0})
 
+    @property
+    def trial_sweeps(self) -> int:
+        """Those for the weight."""
+        return 0 if self.tv_weight is not None else CHOICE_SWEEPS
+
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)
 
@@ -67,13 +72,13 @@ class FistaTv:
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.iterations, trial)
         else:
-            share = self.tv_weight
-            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(projector, problem.weight))
+            share, plain = self.tv_weight, projector.plain
+            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(plain, problem.weight))
         subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
         if self.tv_weight is None and unit > 0:
             used = weight.value if isinstance(weight, NoiseBalance) else weight
-            problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used * subsets.step / len(subsets.views) / unit))
+            problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
     def toy(self) -> Self:

@@ -8,7 +8,7 @@ from functools import cache, partial
 from typing import ClassVar, NamedTuple, Self
 
 from recon.base.arrays import F32, F64
-from recon.base.empirical import FIRST_THRESHOLD, TRIAL_STEPS, TRIAL_SWEEPS, TRIAL_THRESHOLD
+from recon.base.empirical import FIRST_THRESHOLD, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
@@ -17,17 +17,16 @@ from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.held_out import (
     CHOICE_SWEEPS,
+    TRIAL_SWEEPS,
     TRIALS,
     HeldOutTrial,
-    alike_of,
     choose_weight,
-    is_coarse,
     preferred_strength,
 )
 from recon.voxels.iterative import run_iterative
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.pnp_dct import noise_of_volume, pnp_dct
+from recon.voxels.pnp_dct import TRIAL_STEPS, noise_of_volume, pnp_dct
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 from recon.voxels.work import patch_choice, patch_steps
 
@@ -126,9 +125,8 @@ def choose_patches(
     """The strength of `pnp_dct` that views held out prefer, from volumes of total variation with a weight μ.
 
     The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
-    views can be held out. There total variation is taken to predict as well. So it is where voxels are coarse: patches
-    follow the edges within them, and a walnut in a cone loses 0.7 dB, though they predict better. Neither knows of the
-    densest matter: weak matter beside metal keeps its detail.
+    views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
+    matter beside metal keeps its detail.
     """
 
     def chosen() -> list[float]:
@@ -137,12 +135,10 @@ def choose_patches(
         if judge is None or isinstance(weight, NoiseBalance) or first == 0:
             return [first, 0]
         smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
-        found = preferred_strength(partial(residuals_of_patches, judge, smooth), first, alike_of(problem))
+        found = preferred_strength(partial(residuals_of_patches, judge, smooth), first)
         if found is None:
             return [first, 0]
         judge.keep("patches", found)
-        if is_coarse(problem.projector.geometry, problem.projector.grid):
-            return [found.strength, 0]
         return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)

@@ -118,6 +118,13 @@ def test_unknown_words_are_usage(arguments: list[str]) -> None:
     assert "nonsense" in result.stderr
 
 
+@pytest.mark.parametrize("threads", ["0", "-1", "many"])
+def test_a_number_of_threads_that_cannot_be_is_usage(monkeypatch: pytest.MonkeyPatch, threads: str) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
+    done = CliRunner().invoke(module.main, ["info", "x.h5"])
+    assert done.exit_code == 2 and f"NUMBA_NUM_THREADS={threads} in the environment" in done.stderr
+
+
 def test_help_names_every_command() -> None:
     shown = CliRunner().invoke(module.main, ["--help"]).stdout
     for name in module.LazyGroup().list_commands(click.Context(module.main)):

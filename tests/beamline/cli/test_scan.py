@@ -81,6 +81,11 @@ def test_a_rehearsal_says_what_the_scan_takes_and_leaves_nothing_if_asked(tmp_pa
     assert f"At the instrument the plan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
     assert "discarded" in done.stdout and not list(tmp_path.iterdir())
     assert "give --rehearse" in CliRunner().invoke(main, [*real, "--discard"]).stderr
+    series = ["--set", "devices.monochromator={kind: manual, range_kev: [5, 30]}", "--set", "scan.energies=[10, 11]"]
+    for queue in (real, [*real[:2], *real[1:]]):  # one scan, and two in turn
+        done = CliRunner().invoke(main, [*queue, *series, "--rehearse", "--discard"])
+        assert done.exit_code == 2 and "--discard does not go with scan.energies" in done.stderr, done.output
+    assert not list(tmp_path.iterdir())
 
 
 def test_several_scans_are_taken_in_turn_and_ctrl_c_ends_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

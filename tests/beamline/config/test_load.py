@@ -46,6 +46,36 @@ def test_precedence_flags_environment_file_defaults(tmp_path: Path) -> None:
     assert load(path, BEAMLINE_NAME="bl1", HOME="/x").sample.name == "test"
 
 
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("rinsed # 3 times", "rinsed # 3 times"),
+        ("# 3", "# 3"),
+        ("007", "007"),
+        ("before: after", "before: after"),
+        ("[a", "[a"),
+        ("two\nlines", "two\nlines"),
+        ("'quoted # text'", "quoted # text"),
+        ('"a\\tb"', "a\tb"),
+        ("", ""),
+        ("yes", "yes"),
+        ("'s own", None),
+    ],
+)
+def test_a_key_that_takes_text_takes_it_as_it_stands(tmp_path: Path, value: str, text: str | None) -> None:
+    path = write(tmp_path)
+    if text is None:
+        with pytest.raises(ConfigError, match="this is not YAML"):
+            load(path, f"sample.description={value}")
+        return
+    if text:
+        assert load(path, f"sample.description={value}").sample.description == text
+    described = load(path, config.override_of("sample.description", text)).sample.description
+    assert described == text
+    assert load(path, "scan.filter=null").scan.filter is None  # a name, or nothing
+    assert load(path, "scan.period_s=0.2 # s").scan.period_s == 0.2
+
+
 def test_the_process_environment_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BEAMLINE_SAMPLE__NAME", "from-outside")
     assert config.load(write(tmp_path)).sample.name == "from-outside"

@@ -75,7 +75,7 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
 
 
 def test_the_devices_of_the_page_on_epics_are_ones() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "epics.md").read_text("utf-8")
+    page = (Path(__file__).parents[3] / "docs" / "page.md").read_text("utf-8")
     (block,) = re.findall(r"(?s)```yaml\n(.*?)```", page)
     tree = yaml.safe_load((config.config_folder() / "instrument.yaml").read_text("utf-8"))
     tree["devices"] |= yaml.safe_load(block)["devices"]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from beamline.monitor.digest import digest
-from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
+from beamline.monitor.references import GroupVerdict, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.rules.references import look_at
 from drivers.base.frame import FrameKind
 
@@ -50,7 +50,7 @@ def flats(images: Images, first: int = 10) -> list[ReferenceFrame]:
     return group(images, FrameKind.FLAT, first)
 
 
-def faults(found: tuple[JudgedGroup, ...]) -> list[list[str]]:
+def faults(found: tuple[GroupVerdict, ...]) -> list[list[str]]:
     return [[fault.kind for fault in group.faults] for group in found]
 
 

@@ -39,3 +39,14 @@ def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
     references = fake.references()
     views = [replace(frame, counts=np.full_like(frame.counts, 5000)) for frame in fake.views(4)]
     assert [(f.frame, f.score) for f in only(fake.flags(references + views))] == [(11, 1), (12, 2), (13, 3)]
+
+
+def test_frames_of_a_view_without_noise_are_alike_and_views_are_not(fake: Any) -> None:
+    """Of a scene without noise with several frames a view; a camera's darks are never of one value."""
+    plain = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
+    views = fake.views(6)
+    of_two = [replace(views[i // 2], index=i) for i in range(6)]
+    assert only(fake.flags(plain + of_two)) == []
+    assert [f.score for f in only(fake.flags(fake.darks(3) + of_two))] == [1, 1, 1]
+    turned = [replace(frame, counts=views[0].counts) for frame in views]  # the stage turns, and the image stays
+    assert [f.score for f in only(fake.flags(plain + turned))] == [1, 2, 3, 4, 5]

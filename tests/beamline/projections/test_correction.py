@@ -15,6 +15,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.references import Flats
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
+from beamline.storage.rules.references import references_usable
 from recon.prep.correct import Correction, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
@@ -162,3 +163,49 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="views or flats"):
         ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+
+
+BIAS, GLOW = 100.0, 20_000.0  # counts, and counts a second of dark current
+
+
+def _exposed(dark: list[float], flat: float, views: np.ndarray, glow: float = GLOW) -> ArraySource:
+    """Frames without noise: bias and dark current of their own exposure, light by the seconds."""
+    lines, seconds = SCAN.line_integrals(), np.r_[np.repeat(dark, 2), flat, flat, views]
+    light = np.concatenate([np.zeros((2 * len(dark), 4, 40)), np.ones((2, 4, 40)), np.exp(-lines)])
+    t = seconds[:, None, None]
+    keys, angles = [2] * 2 * len(dark) + [1, 1] + [0] * 45, np.r_[np.full(2 * len(dark) + 2, np.nan), SCAN.angles]
+    data = BIAS + glow * t + 60_000.0 * t * light
+    return ArraySource(np.round(data).astype(np.uint16), keys, angles, seconds)
+
+
+@pytest.mark.parametrize(
+    ("dark", "flat", "views"),
+    [
+        ([0.2, 0.05], 0.05, np.full(45, 0.2)),  # each has darks of its own exposure
+        ([0.4, 0.1], 0.05, np.full(45, 0.2)),  # two exposures tell that of any other
+        ([0.05, 0.1, 0.2], 0.1, np.full(45, 0.2)),
+    ],
+)
+@pytest.mark.parametrize("way", ["at once", "in batches"])
+def test_darks_are_dealt_by_exposure(dark: list[float], flat: float, views: np.ndarray, way: str) -> None:
+    source = _exposed(dark, flat, views)
+    frames, none = np.flatnonzero(source.image_key == 0), Selection(steps=(Air("none"),))
+    correction = ScanCorrection(source, none, pytest.fail)  # type: ignore[arg-type]
+    if way == "in batches":
+        out = np.empty((45, 4, 40), np.float32)
+        found = correction.in_batches(frames, out, 7, lambda n, of: None).data
+    else:
+        found = correction.at_once(frames).data
+    np.testing.assert_allclose(found, SCAN.line_integrals(), atol=3e-3)
+    assert not list(references_usable(source))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("flat", [0.1, 0.3])
+def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
+    views = 0.2 + 0.1 * np.sin(2 * SCAN.angles)
+    source = _exposed([0.2], flat, views, glow=0.0)
+    correction = ScanCorrection(source, Selection(steps=(Air("none"),)), pytest.fail)  # type: ignore[arg-type]
+    found = correction.at_once(np.flatnonzero(source.image_key == 0)).data
+    np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
+    assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
+    assert not list(references_usable(source))  # type: ignore[arg-type]

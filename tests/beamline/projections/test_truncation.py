@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from beamline.projections.corrections.air import Air
+from beamline.projections.corrections.references import Flats
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.truncation import cut_sides
@@ -41,6 +42,21 @@ def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: fl
     c = (np.arange(64) - 31.5)[None]
     middle = volume[np.hypot(c, c.T) < 28].mean()
     assert middle == pytest.approx(MU, rel=0.1)
+
+
+@pytest.mark.parametrize(("ring_current", "told_of_current"), [("ignore", True), ("use", False)])
+def test_a_ring_current_that_nothing_corrects_is_told(ring_current: str, told_of_current: bool) -> None:
+    current = np.linspace(200, 150, VIEWS)
+    source, told = scan(90.0, current[:, None, None] / 200), list[str]()
+    source.currents = np.r_[np.full(10, 200.0), current]
+    selection = SELECTION.with_steps(Flats(ring_current=ring_current))
+    prepare_projections(source, selection, told.append)  # type: ignore[arg-type]
+    assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == [
+        True
+    ] * told_of_current
+    source = scan(20.0, current[:, None, None] / 200)  # its air corrects it
+    source.currents = np.r_[np.full(10, 200.0), current]
+    prepare_projections(source, SELECTION, pytest.fail)  # type: ignore[arg-type]
 
 
 def test_columns_that_are_said_to_be_air_are_air() -> None:

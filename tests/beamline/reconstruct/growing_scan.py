@@ -41,7 +41,7 @@ class StandingClock:
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
 INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
-RHYTHM = FollowTiming(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
+RHYTHM = FollowTiming(poll=0.1, slice=0.3, snapshot=0.4, patience=3.0)
 
 
 def schedule(

@@ -195,7 +195,7 @@ def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_res
         done = _spend(high, 20.0, clock, methods=(costly, Fbp()))
         assert done.method == expected
         assert (
-            done.settings["chosen_because"].startswith("residual of views held out, rows ")
+            done.settings["chosen_because"].startswith("trials on rows ")
             and "os-sirt-tv " in done.settings["chosen_because"]
         )
         assert (

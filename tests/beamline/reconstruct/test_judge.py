@@ -74,6 +74,5 @@ def test_the_page_has_the_time_of_the_fit_and_of_the_whole_command(scan: Path, t
     own, whole = (re.search(rf"{label}[^\d]*([\d.]+) s", text) for label in ("Time of reconstruction", "whole command"))
     assert own is not None and whole is not None
     seconds = float(whole[1])
-    assert done.metrics["seconds"] < seconds < done.elapsed + 0.1
-    assert f"{done.metrics['seconds']:.1f} s ({seconds:.1f} s of the whole command)" in text
+    assert done.metrics["seconds"] < seconds == round(done.elapsed, 1)
     assert f"{done.elapsed:.1f} s" in results(done)

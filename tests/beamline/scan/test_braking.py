@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.scan.braking import Braking, by_motion, by_nothing, by_number, placing
+from beamline.scan.braking import Braking, by_motion, by_number, placing, unassigned
 from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, assign, enter
 
 PERIOD, FIRST, N = 0.05, 1_795_152_000.0, 200
@@ -102,7 +102,7 @@ def test_their_number_confirms_frames_of_a_stage_that_brakes_otherwise(path: Pat
     assert found == list(range(STEADY + 1, len(times)))
     # A frame that was exposed and lost counts; one that noise exposed is one too many, and then nothing is confirmed.
     noisy = sorted([*times, stage.began + 0.31 * stage.seconds])
-    assert confirmed(stage.braking(wrong), noisy) == (by_nothing, [EXTRA] * (len(noisy) - STEADY - 1))
+    assert confirmed(stage.braking(wrong), noisy) == (unassigned, [EXTRA] * (len(noisy) - STEADY - 1))
 
 
 def test_noise_in_place_of_a_trigger_is_seen_by_the_intervals() -> None:
@@ -110,7 +110,7 @@ def test_noise_in_place_of_a_trigger_is_seen_by_the_intervals() -> None:
     stage = Stage(12.0, smooth)
     times = stage.triggers()
     times[STEADY + 4] -= 0.6 * PERIOD
-    assert confirmed(stage.braking(), times)[0] is by_nothing
+    assert confirmed(stage.braking(), times)[0] is unassigned
 
 
 def test_a_stage_that_braked_before_it_was_told_confirms_nothing() -> None:
@@ -118,10 +118,10 @@ def test_a_stage_that_braked_before_it_was_told_confirms_nothing() -> None:
     stage = Stage(3.0)
     braking = Braking(FIRST + TOLD * PERIOD, stage.stood - 2.0, stage.braking().deceleration)
     way, found = confirmed(braking, stage.triggers()[:-2])
-    assert way is by_nothing and without(found) == []
+    assert way is unassigned and without(found) == []
 
 
 def test_where_the_start_is_vague_and_no_frame_came_before_nothing_is_confirmed() -> None:
     ledger = Ledger(Train(np.arange(float(N)), PERIOD, FIRST, tolerance=PERIOD))
     braking = Braking(FIRST - 0.3 * PERIOD, 2.7, 1 / (PERIOD * PERIOD * 6))
-    assert placing(ledger, braking, [DeliveredFrame(0, FIRST), DeliveredFrame(1, FIRST + 1.2 * PERIOD)]) is by_nothing
+    assert placing(ledger, braking, [DeliveredFrame(0, FIRST), DeliveredFrame(1, FIRST + 1.2 * PERIOD)]) is unassigned

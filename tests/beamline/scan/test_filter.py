@@ -34,7 +34,7 @@ SHORT = (
 )
 
 
-class Told:
+class RecordingFilter:
     """A filter that notes when it was told, among the frames of the fake instrument."""
 
     name = "filter"
@@ -56,7 +56,7 @@ class Told:
 def test_it_is_there_before_the_first_frame_and_in_the_file(tmp_path: Path, asked: str, written: str) -> None:
     frames: list[int] = []
     instrument = FakeInstrument(on_frame=lambda n: frames.append(len(instrument.log)))
-    instrument.devices = replace(instrument.devices, filter=Told(instrument))
+    instrument.devices = replace(instrument.devices, filter=RecordingFilter(instrument))
     run = ran.Ran(tmp_path, instrument, KIND, f"scan.filter={asked}")
     assert run.error is None and run.folder is not None
     told = [i for i, line in enumerate(instrument.log) if line.startswith("filter")]
@@ -69,7 +69,7 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(tmp_path: Path, aske
 
 def test_one_that_does_not_obey_ends_the_scan_safely_without_a_frame(tmp_path: Path) -> None:
     instrument = FakeInstrument()
-    instrument.devices = replace(instrument.devices, filter=Told(instrument, broken=True))
+    instrument.devices = replace(instrument.devices, filter=RecordingFilter(instrument, broken=True))
     run = ran.Ran(tmp_path, instrument, KIND, "scan.filter=Al 1 mm")
     assert isinstance(run.error, DeviceError) and "it is stuck" in str(run.error)
     assert "close shutter" in instrument.log

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from beamline.scan.live_plan import live_need, live_plan
+from beamline.config.load import config_folder, load, plan_of
+from beamline.scan.live_plan import better_order, live_need, live_plan
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,22 @@ def test_its_need_of_memory_and_the_reason_are_stated() -> None:
     ):  # fmt: skip
         assert part in reduced
     assert "columns" not in live_need((256, 256), 180, int(1e9))
+
+
+@pytest.mark.parametrize(
+    ("changes", "proposed"),
+    [
+        ((), "{scheme: interlaced, passes: 6} 22.0"),
+        (("scan.mode=step", "scan.period_s=1"), "{scheme: golden} 22.9"),
+        (("scan.angles.views=181",), None),  # of no number of equal passes
+        (("scan.angles={scheme: interlaced, views: 180, passes: 6}",), None),
+        (("scan.angles.views=24",), None),  # over before anybody looks
+    ],
+)
+def test_an_order_whose_live_volume_is_better_is_proposed_in_the_words_of_the_configuration(
+    changes: tuple[str, ...], proposed: str | None
+) -> None:
+    said = better_order(plan_of(load(config_folder() / "demo.yaml", changes)))
+    assert len(said) == (proposed is not None)
+    if proposed is not None:
+        assert proposed in said[0] and "15.0, 19.6, 22.7" in said[0]

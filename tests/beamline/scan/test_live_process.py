@@ -125,6 +125,40 @@ def test_a_live_reconstruction_that_dies_touches_nothing(tmp_path: Path, code: s
         assert "out of memory" in (ran.folder / "recon.log").read_text(encoding="utf-8")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("times", [1, 9])
+def test_one_that_is_killed_in_the_scan_is_started_again_but_not_for_ever(tmp_path: Path, times: int) -> None:
+    code = f"""
+import json, os, pathlib, signal, sys
+starts = pathlib.Path(sys.argv[1]).with_name("starts")
+starts.write_text(starts.read_text() + "+" if starts.exists() else "+")
+if len(starts.read_text()) <= {times}:
+    os.kill(os.getpid(), signal.SIGKILL)
+pathlib.Path(sys.argv[2]).write_text("volume")
+print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}}))
+"""
+
+    def wait(number: int) -> None:
+        deadline = time.monotonic() + 60
+        while (
+            number == 10
+            and time.monotonic() < deadline
+            and not ("recon_done" in said or sum("again" not in text for text in said if "has ended" in text))
+        ):
+            time.sleep(0.02)
+
+    said: list[str] = []
+    instrument = FakeInstrument(on_frame=wait)
+    result = run_scan(
+        small(), tmp_path, [lambda event: said.append(str(event.data.get("message", event.event)))],
+        live=script(code), instrument=instrument.connected(),
+    )  # fmt: skip
+    (folder,) = tmp_path.iterdir()
+    assert (folder / "starts").read_text() == "+" * min(times + 1, 3)
+    assert sum("It is started again" in text for text in said) == min(times, 2)
+    assert (result.recon is not None) == (times == 1)
+
+
 def test_one_that_dies_in_the_scan_is_told_at_once(tmp_path: Path) -> None:
     def wait_for_the_warning(number: int) -> None:
         deadline = time.monotonic() + 20

@@ -40,7 +40,7 @@ NICKEL = {  # a thin cylinder on the axis: a ray near its middle passes about 0.
 }
 
 
-class Told:
+class RecordingMonochromator:
     """A monochromator that notes when it was told, among the frames of the fake instrument."""
 
     name = "monochromator"
@@ -62,7 +62,7 @@ class Told:
 def test_it_is_there_before_the_first_frame_and_in_the_file(tmp_path: Path, asked: str, written: float) -> None:
     frames: list[int] = []
     instrument = FakeInstrument(on_frame=lambda n: frames.append(len(instrument.log)))
-    instrument.devices = replace(instrument.devices, monochromator=Told(instrument))
+    instrument.devices = replace(instrument.devices, monochromator=RecordingMonochromator(instrument))
     run = ran.Ran(tmp_path, instrument, KIND, f"scan.energy={asked}")
     assert run.error is None and run.folder is not None
     told = [i for i, line in enumerate(instrument.log) if line.startswith("energy")]
@@ -76,7 +76,7 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(tmp_path: Path, aske
 
 def test_one_that_does_not_obey_ends_the_scan_safely_without_a_frame(tmp_path: Path) -> None:
     instrument = FakeInstrument()
-    instrument.devices = replace(instrument.devices, monochromator=Told(instrument, broken=True))
+    instrument.devices = replace(instrument.devices, monochromator=RecordingMonochromator(instrument, broken=True))
     run = ran.Ran(tmp_path, instrument, KIND, "scan.energy=8.34")
     assert isinstance(run.error, DeviceError) and "it is stuck" in str(run.error)
     assert "close shutter" in instrument.log

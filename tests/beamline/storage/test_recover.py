@@ -22,8 +22,7 @@ from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover
-from beamline.storage.superblock import lookup3, superblock
-from beamline.storage.torn import block_size
+from beamline.storage.superblock import block_size, lookup3, superblock
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout, nxtomo
 from beamline.storage.writers.nxtomo import NXtomoWriter

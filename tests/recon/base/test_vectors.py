@@ -115,7 +115,7 @@ def test_views_that_no_such_detector_has_are_refused_with_the_view_and_by_how_mu
     rng = np.random.default_rng(2)
     cone = free_cone(rng, 3)
     cone[1, 6:9] *= 1.02
-    with pytest.raises(ValueError, match=r"view 1: a corner .* 0\.[0-9]+ pixels .* at most 0\.1"):
+    with pytest.raises(ValueError, match=r"view 1: .* off by 0\.[0-9]+ pixels"):
         geometry_of_vectors(cone, SHAPE, cone=True)
     cone = free_cone(rng, 3)
     cone[2, 9:] *= -1
@@ -125,7 +125,7 @@ def test_views_that_no_such_detector_has_are_refused_with_the_view_and_by_how_mu
         geometry_of_vectors([(0, -10, 0, 0, -5, 0, 0.1, 0, 0, 0, 0, 0.1)], SHAPE, cone=True)
     oblique = free_parallel(rng, 2)
     oblique[1, :3] = oblique[1, 6:9] * 5 + np.cross(oblique[1, 9:], oblique[1, 6:9]) * 9
-    with pytest.raises(ValueError, match="view 1: a corner"):
+    with pytest.raises(ValueError, match="view 1: its detector pixels are not square"):
         geometry_of_vectors(oblique, SHAPE, cone=False)
     with pytest.raises(ValueError, match="view 1: u and v"):
         oblique[1, :3] = oblique[1, 6:9]

@@ -148,15 +148,16 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     assert psnr(truth, found) > psnr(truth, fitted) > psnr(truth, raw) + 10
 
 
-def test_where_voxels_cannot_explain_the_views_the_fit_is_not_spoiled() -> None:
+def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     # Voxels of three pixels: a blob of four pixels is no sum of them.
     grid = Grid((4, 14, 14), 3.0)
     g = Gaussians.from_physical(np.array([[4.0, 2.0, 0.0]]), np.full((1, 3), 2.0), np.array([0.5]), density_unit=0.5)
     data = project(g, VIEWS).numpy() + np.random.default_rng(1).normal(0, 0.002, (30, 8, 40)).astype(np.float32)
     volume = _of(g, grid)
+    truth = _of(g, Grid((12, 42, 42), 1.0)).data.reshape(4, 3, 14, 3, 14, 3).mean((1, 3, 5))
     found = finish(volume, g, _problem(data, grid=grid)).volume.data
     raw = FistaTv(20).run(_problem(data, grid=grid), RunControl()).volume.data
-    assert psnr(volume.data, found) > psnr(volume.data, raw) + 3
+    assert psnr(truth, found) > psnr(truth, raw) + 1 and psnr(truth, found) > psnr(truth, volume.data) + 1
 
 
 def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
@@ -208,12 +209,12 @@ def test_another_slab_makes_no_trial(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A chequered box, sharp to the voxel; the fit of a trial is ten times as dense, which no sweeps mend."""
+    """A chequered box, sharp to the voxel; the fit of a trial is a hundred times as dense, which no sweeps mend."""
     data = Projector(VIEWS, GRID).forward(_box()) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
 
     def poor(part: ReconProblem, *_: object) -> Reconstruction:
         fitted = R2(steps=5, gaussians=50, finish=0).run(part, RunControl())
-        fitted.volume.data[...] *= 10
+        fitted.volume.data[...] *= 100
         return fitted
 
     fit = Mock(side_effect=poor)
@@ -237,9 +238,9 @@ def test_a_stop_ends_the_trials() -> None:
     assert tried.by_voxels is None and not tried.prior
 
 
-@pytest.mark.parametrize(("voxels", "sweeps", "seconds"), [(24, 8, None), (12, 4, 1e9)])
-def test_a_longer_fit_changes_less(voxels: int, sweeps: int, seconds: float | None) -> None:
-    """Four times the steps: half the rates, and half the finish where voxels are coarse; so by a clock, too."""
+@pytest.mark.parametrize(("voxels", "seconds"), [(24, None), (12, 1e9)])
+def test_a_longer_fit_changes_less(voxels: int, seconds: float | None) -> None:
+    """Four times the steps: half the rates; so by a clock, too."""
     cone = Geometry.cone(np.linspace(0, 2 * math.pi, 12, endpoint=False), (24, 24), 1.0, 60.0, 72.0)
     grid = Grid((voxels,) * 3, 24 * cone.sample_pitch / voxels)
     data = Projector(cone, grid).forward(np.pad(np.full((6, 6, 6), 0.1, np.float32), (voxels - 6) // 2))
@@ -247,4 +248,4 @@ def test_a_longer_fit_changes_less(voxels: int, sweeps: int, seconds: float | No
     method = R2(steps=8, seconds=seconds, gaussians=30, fit=settings)
     made = reconstruct(data, cone, method, grid=grid).settings
     assert (made["pace"], made["tv_least"]) == (settings.pace / 2, settings.tv_least / 2)
-    assert made["finish"] == sweeps
+    assert made["finish"] == 8

@@ -28,11 +28,12 @@ from recon.voxels.held_out import (
     busiest_rows,
     columns_of_matter,
     preferred_strength,
-    residuals_by_view,
     slab_of,
     split_views,
+    unseen_residuals,
 )
 from recon.voxels.projector import Projector
+from recon.voxels.resolution import Resolution
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
 
@@ -241,9 +242,12 @@ def test_trials_see_the_columns_with_matter() -> None:
 
 
 def test_residuals_leave_out_rays_and_views_that_do_not_count() -> None:
-    views, differences = np.ones((3, 2, 4), np.float32), np.full((3, 2, 4), 2.0, np.float32)
-    differences[0, 0], differences[1] = np.nan, np.nan
-    parallel = Geometry.parallel(np.zeros(3), (2, 4), pixel_pitch=1.0)
-    np.testing.assert_allclose(residuals_by_view(differences.copy(), views, parallel), [2.0, 2.0])
-    cone = Geometry.cone(np.zeros(3), (2, 4), sod=10.0, sdd=20.0, pixel_pitch=1.0)
-    assert np.isinf(residuals_by_view(differences.copy(), np.zeros_like(views), cone)).all()  # all rays miss matter
+    views, model = np.ones((3, 4, 2), np.float32), np.full((3, 4, 2), 3.0, np.float32)
+    views[0, 0], views[1] = np.nan, np.nan
+    for geometry in (
+        Geometry.parallel(np.zeros(3), (2, 4), pixel_pitch=1.0),
+        Geometry.cone(np.zeros(3), (2, 4), sod=10.0, sdd=20.0, pixel_pitch=1.0),
+    ):
+        resolution = Resolution.of(geometry, Grid.matching(geometry))
+        np.testing.assert_allclose(unseen_residuals(model, views, None, resolution), [2.0, 2.0], rtol=1e-6)
+        assert np.isinf(unseen_residuals(model, views, np.zeros_like(views), resolution)).all()

@@ -45,10 +45,12 @@ def blocks(grid: Grid, scale: float = 1.0) -> NDArray[np.float32]:
     return data
 
 
-def parallel_case(n_views: int = 7, noise: float = 0.0) -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
+def parallel_case(
+    n_views: int = 7, noise: float = 0.0, matched: bool = False
+) -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
     """Projector, truth and its projections, with white noise of a share of their largest value."""
     geometry = Geometry.parallel(np.arange(n_views) * np.pi / n_views + 0.1, (6, 20), pixel_pitch=0.5, axis_col=9.2)
-    projector = Projector(geometry, Grid((6, 18, 17), 0.5))
+    projector = Projector(geometry, Grid((6, 18, 17), 0.5), matched)
     truth = blocks(projector.grid)
     views = projector.forward(truth)
     return projector, truth, views + _noise(views, noise)
@@ -56,7 +58,7 @@ def parallel_case(n_views: int = 7, noise: float = 0.0) -> tuple[Projector, NDAr
 
 def cone_case() -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
     geometry = Geometry.cone(np.arange(8) * np.pi / 4, (8, 22), 0.9, 30.0, 45.0)
-    projector = Projector(geometry, Grid((6, 15, 16), 0.6, slice_pitch=0.7))
+    projector = Projector(geometry, Grid((6, 15, 16), 0.6, slice_pitch=0.7), matched=False)
     truth = blocks(projector.grid)
     return projector, truth, projector.forward(truth)
 
@@ -352,7 +354,7 @@ def test_units_do_not_matter(method: IterativeMethod, weight: float, pitch: floa
     projector, _, views = parallel_case(noise=0.02)
     plain = solve(replace(method, iterations=4), projector, views).data
     geometry, grid = projector.geometry, projector.grid
-    there = Projector(replace(geometry, pixel_pitch=0.5 * pitch), Grid(grid.shape, 0.5 * pitch))
+    there = Projector(replace(geometry, pixel_pitch=0.5 * pitch), Grid(grid.shape, 0.5 * pitch)).plain
     found = solve(replace(method, iterations=4), there, views, weight=np.full(views.shape, weight, np.float32)).data
     np.testing.assert_allclose(found.astype(np.float64) * pitch, plain, atol=3e-4)
 
@@ -368,6 +370,7 @@ def test_powers_of_ten_of_every_unit_leave_the_volume_as_it_is(
     there = Projector(
         replace(g, pixel_pitch=g.pixel_pitch * edge, sod=g.sod * edge, sdd=g.sdd * edge),
         Grid(box.shape, box.voxel_size * edge, slice_pitch=box.spacing[0] * edge),
+        projector.matched,
     )
     weights = np.full(views.shape, 10.0**weight, np.float32)
     found = solve(replace(method, iterations=3), there, (views * 10.0**size).astype(np.float32), weight=weights).data
@@ -400,7 +403,7 @@ def test_a_small_slice_takes_few_threads_and_gives_them_back(edge: int, threads:
 @pytest.mark.parametrize("method", [FistaTv(iterations=6), OsSirtTv(iterations=8)])
 @pytest.mark.parametrize("n_views", [10, 24])  # by the noise, and by views held out
 def test_the_weight_that_was_chosen_is_recorded_and_gives_the_same_volume(method: Method, n_views: int) -> None:
-    projector, _, views = parallel_case(n_views, 0.02)
+    projector, _, views = parallel_case(n_views, 0.02, matched=True)
     chosen = reconstruct(views, projector.geometry, method, grid=projector.grid)
     weight = chosen.settings["tv_weight_chosen"]
     given = reconstruct(views, projector.geometry, replace(method, tv_weight=weight), grid=projector.grid)

@@ -16,6 +16,7 @@ from scipy import sparse
 
 from recon.base.geometry import Geometry
 from recon.base.ray_model import RayModel
+from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_kernels
 from recon.kernels.cpu import joseph
@@ -82,9 +83,14 @@ def test_both_directions_are_the_explicit_matrix(case: tuple[Geometry, Grid, int
     _assert_the_matrix(*case, lambda matrix: 1.6e-4 * abs(matrix).sum() / max(1, matrix.nnz))
 
 
+def _samples(geometry: Geometry, grid: Grid) -> Projector:
+    """Joseph's samples alone, neither sharpened nor spread over a pixel."""
+    return Projector(geometry.seen_with(RayWidth(pixel=1e-6)), grid).plain
+
+
 def _assert_the_matrix(geometry: Geometry, grid: Grid, seed: int, room: Callable[[sparse.csr_array], float]) -> None:
     rng = np.random.default_rng(seed)
-    projector, matrix = Projector(geometry, grid), system_matrix(geometry, grid)
+    projector, matrix = _samples(geometry, grid), system_matrix(geometry, grid)
     volume = rng.random(grid.shape, dtype=np.float32)
     views = rng.random(projector.projection_shape, dtype=np.float32)
     expected = (matrix @ volume.ravel()).reshape(views.shape)
@@ -202,7 +208,7 @@ def test_tiles_make_no_difference(rng: np.random.Generator) -> None:
     geometry = Geometry.parallel(
         [0.0, np.pi / 2, np.pi / 4, 0.3, 1.2, 2.0, 2.9], (75, 84), pixel_pitch=1.0, axis_col=42.5
     )
-    projector, matrix = Projector(geometry, Grid((75, 97, 66))), system_matrix(geometry.rows(0, 1), Grid((1, 97, 66)))
+    projector, matrix = _samples(geometry, Grid((75, 97, 66))), system_matrix(geometry.rows(0, 1), Grid((1, 97, 66)))
     volume = rng.random(projector.grid.shape, dtype=np.float32)
     views = rng.random(projector.projection_shape, dtype=np.float32)
     forward, adjoint = projector.forward(volume), projector.adjoint(views)
@@ -225,7 +231,7 @@ def test_steps_of_any_length_make_no_difference(slices_a_row: float, rng: np.ran
     shifts = np.array([[0.3, 0.0], [-1.2, 25.0], [0.0, -40.0]])
     geometry = Geometry.cone([0.3, 2.4, 4.0], (40, 7), 1.0, 60.0, 75.0, axis_row=20.0, shifts=shifts)
     grid = Grid((37, 35, 3), 1.1, (3.0, -2.0, 4.0), geometry.sample_pitch / slices_a_row)
-    projector, matrix = Projector(geometry, grid), system_matrix(geometry, grid)
+    projector, matrix = _samples(geometry, grid), system_matrix(geometry, grid)
     volume = rng.random(grid.shape, dtype=np.float32)
     views = rng.random(projector.projection_shape, dtype=np.float32)
     expected = (matrix @ volume.ravel()).reshape(views.shape)

@@ -49,14 +49,14 @@ def test_a_spread_has_its_variances_and_keeps_the_sum(rng: np.random.Generator) 
     point = np.zeros((2, 31, 29), np.float32)
     point[:, 15, 14] = 1
     across = np.array([0.3, 2.0])
-    found = spread(point, across, 1.1).astype(np.float64)
+    found = spread(point, across, np.full(2, 1.1)).astype(np.float64)
     np.testing.assert_allclose(found.sum((1, 2)), 1, rtol=1e-5)
     col, row = np.arange(31) - 15, np.arange(29) - 14
     np.testing.assert_allclose((found * col[:, None] ** 2).sum((1, 2)), across, rtol=1e-4)
     np.testing.assert_allclose((found * row**2).sum((1, 2)), 1.1, rtol=1e-4)
     assert found.min() >= 0
     edge = rng.random((2, 5, 1), dtype=np.float32)  # nothing is lost at the edges, and one row has no neighbours
-    np.testing.assert_allclose(spread(edge, across, 1.1).sum((1, 2)), edge.sum((1, 2)), rtol=1e-5)
+    np.testing.assert_allclose(spread(edge, across, np.full(2, 1.1)).sum((1, 2)), edge.sum((1, 2)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("beam", [PARALLEL, CONE], ids=["parallel", "cone"])
@@ -66,15 +66,15 @@ def test_an_exposure_is_the_mean_of_its_moments(beam: Geometry, rng: np.random.G
     seen = views_of_exposure(turning)
     assert len(seen) == math.ceil(0.2 * beam.reach / beam.sample_pitch)  # a step of at most a pixel at the rim
     assert np.mean([one.angles - beam.angles for one in seen]) == pytest.approx(0)
-    expected = np.mean([Projector(one.seen_with(RayWidth()), grid).forward(volume) for one in seen], axis=0)
-    np.testing.assert_allclose(Projector(turning, grid).forward(volume), expected, rtol=1e-5, atol=1e-6)
+    expected = np.mean([Projector(one.seen_with(RayWidth()), grid).plain.forward(volume) for one in seen], axis=0)
+    np.testing.assert_allclose(Projector(turning, grid).plain.forward(volume), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("skew", [2e-3, -2e-3])
 def test_each_row_sees_its_own_angle(skew: float, rng: np.random.Generator) -> None:
     grid = Grid((40, 30, 33), 0.05)
     volume = rng.random(grid.shape, dtype=np.float32)
-    found = Projector(PARALLEL.seen_with(RayWidth(), skew), grid).forward(volume)
+    found = Projector(PARALLEL.seen_with(RayWidth(), skew), grid).plain.forward(volume)
     bands = bands_of(PARALLEL.seen_with(RayWidth(), skew), grid)
     assert [row for band, _ in bands for row in range(40)[band]] == list(range(40)) and len(bands) == 6
     for band, views in bands:
@@ -82,8 +82,8 @@ def test_each_row_sees_its_own_angle(skew: float, rng: np.random.Generator) -> N
             off = np.abs(views.angles - (ANGLES + row * skew)).max() * views.reach / views.pixel_pitch
             assert off < 0.13 and views.skew == 0
         row = (band.start + band.stop) // 2
-        np.testing.assert_allclose(found[:, row], Projector(views, grid).forward(volume)[:, row], rtol=1e-4)
-        still = Projector(PARALLEL, grid).forward(volume)[:, row]
+        np.testing.assert_allclose(found[:, row], Projector(views, grid).plain.forward(volume)[:, row], rtol=1e-4)
+        still = Projector(PARALLEL, grid).plain.forward(volume)[:, row]
         assert np.abs(found[:, row] - still).max() > 0.01
 
 

@@ -6,8 +6,8 @@ const $ = (id) => document.getElementById(id);
 const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "invalid" };
 const COLOURS = { done: "good", complete: "good", paused: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
 const columns = { kind: [], angle: [], time: [], mean: [] };
-const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] } };
-let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 };
+const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] }, error: { x: [], y: [] } };
+let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
 
 // --- frame -------------------------------------------------------------------------------------------------------
 const frameWindows = {};  // of a kind of frame, so that flats and views each keep theirs
@@ -131,8 +131,18 @@ $("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
 // --- volume ------------------------------------------------------------------------------------------------------
 const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
 const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
+  draw: (context, place) => { if (axis === 0 && volume && volume.unseen_deg.length) dial(context, volume.unseen_deg); },
   point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
 }));
+
+/** Rays in a slice (y downwards) that no view has taken yet: edges along them are unknown. A ray of θ runs along -sin θ, cos θ. */
+function dial(context, [first, last]) {
+  const radius = 26, x = context.canvas.clientWidth - radius - 8, y = radius + 8;
+  context.fillStyle = context.strokeStyle = "#d29922"; context.font = "12px sans-serif"; context.textAlign = "right";
+  context.beginPath(); context.arc(x, y, radius, 0, 2 * Math.PI); context.stroke();
+  for (const half of [90, 270]) { context.beginPath(); context.moveTo(x, y); context.arc(x, y, radius, (first + half) * Math.PI / 180, (last + half) * Math.PI / 180); context.fill(); }
+  context.fillText(`rays to come: ${(last - first).toFixed(0)} of 180 degrees`, x - radius - 6, y + 4);
+}
 
 function place(axis, row, col) {
   const index = [0, 0, 0];
@@ -146,7 +156,7 @@ async function fetchVolume() {
   if (!answer.ok) return;
   const first = volume === null, before = volume;
   [volume] = await answer.json();
-  $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `views 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}`;
+  $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `views 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}${volume.because ? `; ${volume.because}` : ""}`;
   const changed = !before || before.shape.join() !== volume.shape.join();
   for (let axis = 0; axis < 3; axis++) {
     $(`at${axis}`).max = volume.shape[axis] - 1;
@@ -180,7 +190,7 @@ async function fetchModel() {
 }
 
 // --- curves ------------------------------------------------------------------------------------------------------
-const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"] };
+const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"], error: ["views", "error along views held out"] };
 
 async function fetchTrace() {
   if (!region) return;
@@ -216,7 +226,8 @@ function onRun(event) {
     case "flag": advice.push(data); log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning", data.frame); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
-    case "progress": if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
+    case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
+    case "progress": if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
     case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
     case "warning": log(data, data.message, "warning"); break;
@@ -279,6 +290,8 @@ function header(now) {
   }
   if (now.status === "running") shown["last frame"] = `${now.age_s.toFixed(0)} s ago`;
   if (curves.beam.y.length) shown.beam = `${curves.beam.y[curves.beam.y.length - 1].toPrecision(4)} ${curves.beam.unit}`;
+  if (fit && now.status === "running") shown.volume = `${fit.n_views} views${fit.waiting ? `, ${fit.waiting} wait` : ""}, ${(fit.step / fit.views).toFixed(1)} steps a view, ${fit.n_gaussians} Gaussians`;
+  else if (fit && fit.steps && fit.step < fit.steps) shown.volume = `last round: step ${fit.step} of ${fit.steps}${fit.eta_s === null ? "" : `, ${duration(fit.eta_s)}`}`;
   shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
   $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
   const over = now.status !== "running" && now.status !== "preparing";

@@ -158,7 +158,7 @@ def curve_memory(geometry: Geometry, step: Hardening) -> int:
 
 
 def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
-    """The curve by the paths through the sample as its own reconstruction shows it, taken as one material.
+    """Fit the curve to path lengths from a first reconstruction, with the sample taken as one material.
 
     The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of
     views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).

@@ -18,9 +18,9 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.archive import archive as module
 from beamline.features.archive.archive import archive
+from beamline.features.archive.command import CODECS
 from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
-from beamline.storage.codecs import CODECS
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover

@@ -237,7 +237,7 @@ def _bare(folder: Path) -> None:
         (("--angles", "long.txt"), "--angle-rows A:B"),
         (("--angles", "long.txt"), "--angle-rows 2:7 takes the 5 neighbours"),
         (("--angles", "long.txt", "--angle-rows", "5"), "--angle-rows 5 is not of the form A:B"),
-        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 does not lie within the 9 angles"),
+        (("--angles", "long.txt", "--angle-rows", "5:12"), "--angle-rows 5:12 is out of range: the file has 9 angles"),
         (("--angle-rows", "1:6"), "--angle-rows 1:6 needs angles to choose from: give --angles FILE."),
         (("--angles", "none.txt"), "The angles in none.txt cannot be read (No such file or directory)."),
         (("--flats", "none.tif"), "The reference frames in none.tif cannot be read (No such file or directory)."),

@@ -14,8 +14,8 @@ from beamline.features.queue.scans import (
     QueuedScan,
     QueueError,
     QueueStatus,
+    RecordedScan,
     RunNotes,
-    TakenScan,
     load_queue,
     queue_needs,
     raise_unless_complete,
@@ -54,6 +54,14 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
         queue_needs(load_queue([tmp_path / "day.csv"], ["scan.period_s=0.001"]), tmp_path).refuse_impossible()
 
 
+def test_a_cell_is_the_text_that_stands_in_it(tmp_path: Path) -> None:
+    lines = "config,sample.name,sample.description", f"{SIMULATED},a,rinsed # 3 times", f'{SIMULATED},b,"x\ny, z"'
+    scans = load_queue([table(tmp_path, *lines)], ())
+    assert [scan.config.sample.description for scan in scans] == ["rinsed # 3 times", "x\ny, z"]
+    with pytest.raises(ConfigError, match=r"line 5: .*'cell #1'; expected text of letters"):
+        load_queue([table(tmp_path, *lines, f"{SIMULATED},cell #1,")], ())
+
+
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
@@ -72,12 +80,12 @@ def test_a_wrong_table_is_refused_with_its_lines(tmp_path: Path, lines: tuple[st
 
 
 def test_a_failure_does_not_keep_the_next_from_its_turn(queue: tuple[QueuedScan, ...], tmp_path: Path) -> None:
-    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> TakenScan:
+    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> RecordedScan:
         run(RunStarted(tmp_path / waiting.name, tmp_path, waiting.name, 1, 1.0, 1, ()))
         if n == 1:
             stop.stop("the monitor asked", by_itself=True)
             raise DataError("frames are missing")
-        return TakenScan(tmp_path / f"{n}.h5", ("2 frames have an alarm.",) * (n == 2))
+        return RecordedScan(tmp_path / f"{n}.h5", ("2 frames have an alarm.",) * (n == 2))
 
     outcomes = run_queue(queue, take)
     assert [outcome.status for outcome in outcomes] == [QueueStatus.COMPLETE, QueueStatus.FAILED, QueueStatus.ALARMS]
@@ -98,7 +106,7 @@ def test_nothing_begins_after_a_stop_or_with_an_instrument_that_did_not_obey(
 ) -> None:
     begun = []
 
-    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> TakenScan:
+    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> RecordedScan:
         begun.append(waiting.name)
         if how == "interrupt":
             raise KeyboardInterrupt
@@ -108,7 +116,7 @@ def test_nothing_begins_after_a_stop_or_with_an_instrument_that_did_not_obey(
         stop.stop()
         if how == "stop":
             raise ScanStopped("Stopped after 3 of 9 projections")
-        return TakenScan(Path("s.h5"))
+        return RecordedScan(Path("s.h5"))
 
     outcomes = run_queue(queue, take)
     assert begun == ["one"] and {outcome.status for outcome in outcomes[1:]} == {QueueStatus.NOT_STARTED}

@@ -155,7 +155,7 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
         prepared(path, file, cone=(10.0, 15.0))
     cone[5, 6:9] *= 1.1
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(DataError, match=r"view 5: a corner .* Nothing was read"):
+    with pytest.raises(DataError, match=r"view 5: its detector pixels .* Nothing was read"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
     with pytest.raises(ValueError, match=r"expected a header .*src_x, src_y"):
         read_poses(str(table(tmp_path, columns.replace(",u_z", ""), np.arange(N), *np.delete(cone, 8, axis=1).T)))
@@ -279,7 +279,7 @@ def test_poses_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=match):
             prepared(path, table(tmp_path, head, *columns))
     turned = (PosesOfFile(read_poses(str(every(tmp_path)))), TiltAndLens(1.0))
-    with pytest.raises(ConfigError, match="--tilt turns views"):
+    with pytest.raises(ConfigError, match="--tilt and --poses both"):
         prepared(path, every(tmp_path), steps=turned)
 
 

@@ -15,7 +15,7 @@ from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Entry
 
 ROWS, COLS, VIEWS = 4, 6, 5
@@ -176,6 +176,11 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
     "instrument/monochromator/wavelength": (
         [("instrument/monochromator/wavelength", WAVELENGTH / 10, "nm")], lambda s: s.energy_kev, 25,
     ),
+    "detector/pixel_mask": (
+        [("detector/pixel_mask", np.eye(ROWS, COLS, dtype=np.uint32), None)],
+        lambda s: np.flatnonzero(s.read([0])[0] == 0).tolist(),
+        np.flatnonzero(np.eye(ROWS, COLS)).tolist(),
+    ),
     "detector/x_flipped": (
         [("detector/x_flipped", True, None)], lambda s: s.attributes["flipped"].split(":")[0], "left to right",
     ),
@@ -208,6 +213,33 @@ USED_EXCHANGE: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[Scan
         [(f"{PIXEL}/x_pixel_size", 6.5e-6, "m"), (f"{PIXEL}/objective/magnification", 10, None)],
         lambda s: s.pixel_size_mm,
         0.65e-3,
+    ),
+}  # fmt: skip
+FLAT_FIELDS = "process/acquisition/flat_fields"
+DIFFERENT = np.frombuffer(b"Different".ljust(40, b"\0"), np.uint8)[None]
+USED_EXCHANGE |= {
+    f"{PIXEL}/exposure_time": ([(f"{PIXEL}/exposure_time", [100.0], "ms")], lambda s: s.exposures.tolist(), [0.1] * 7),
+    f"{FLAT_FIELDS}/flat_exposure_time": (
+        [
+            (f"{PIXEL}/exposure_time", 0.1, "s"), (f"{FLAT_FIELDS}/flat_exposure_time", [0.05], None),
+            (f"{FLAT_FIELDS}/different_flat_exposure", DIFFERENT, None),
+        ],
+        lambda s: s.exposures[:3].tolist(), [0.1, 0.05, 0.1],
+    ),
+    f"{FLAT_FIELDS}/different_flat_exposure": (
+        [
+            (f"{PIXEL}/exposure_time", 0.1, "s"), (f"{FLAT_FIELDS}/flat_exposure_time", [0.05], "s"),
+            (f"{FLAT_FIELDS}/different_flat_exposure", "Same", None),
+        ],
+        lambda s: s.exposures[:3].tolist(), [0.1, 0.1, 0.1],
+    ),
+    "exchange/theta_white": (
+        [("exchange/theta_white", [72.0], "deg"), ("exchange/theta_dark", [0.0], "deg")],
+        lambda s: s.image_key.tolist(), [2, 0, 0, 1, 0, 0, 0],
+    ),
+    "exchange/theta_dark": (
+        [("exchange/theta_white", [0.0], None), ("exchange/theta_dark", [144.0], None)],
+        lambda s: s.image_key.tolist(), [1, 0, 0, 0, 0, 0, 2],
     ),
 }  # fmt: skip
 TRIED = {"detector/transformations"}  # below
@@ -382,3 +414,60 @@ def test_the_page_lists_every_field() -> None:
     for field in (*NXTOMO, *EXCHANGE):
         use = field.use if field.used else f"not used{', warned of' if field.matters else ''}: {field.use}"
         assert f"| `{field.where}` | {use} |\n" in page, field.where
+
+
+UNKNOWN: dict[
+    str, tuple[Any, bool | None]
+] = {  # values under names that nobody reads, and whether they may change a number
+    "instrument/pco/exposure_of_frame": (np.r_[0, 0, np.arange(VIEWS)] * 0.1, True),
+    "instrument/pco/exposure_of_view": (np.arange(VIEWS) * 0.1, True),
+    "instrument/machine/current": (np.r_[1, 2, [200.0] * VIEWS], False),  # the same in all views
+    "instrument/thermometer/value": (np.arange(2.0 + VIEWS), False),
+    "sample/temperature": (293.0, False),
+    "instrument/pco/gain": (3.0, None),  # one number that tells nothing of these
+    "instrument/pco/table": (np.zeros(3), None),
+}
+
+
+@pytest.mark.parametrize("where", UNKNOWN)
+def test_what_is_stated_of_each_frame_under_another_name_is_named(tmp_path: Path, where: str) -> None:
+    value, doubt = UNKNOWN[where]
+    hits = [hit for hit in validate(nxtomo(tmp_path / "s.nx", (where, value, None))) if where in hit.message]
+    assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
+    hits = [hit for hit in validate(exchange(tmp_path / "s.h5", (where, value, None))) if where in hit.message]
+    assert [hit.severity for hit in hits] == ([] if doubt is None else ["warning" if doubt else "info"])
+
+
+def test_info_shows_what_is_used(tmp_path: Path) -> None:
+    path = nxtomo(tmp_path / "s.nx", ("control/data", np.arange(7.0) + 200, "mA"))
+    used = describe(path)["used"]
+    assert used["control/data"].startswith("200 to 206 mA (used: ring current of each frame")
+    assert used["sample/rotation_angle"].startswith("0 to 144 degree")
+
+
+def test_another_scan_of_the_file_is_named(tmp_path: Path) -> None:
+    def second(entry: h5py.Group) -> None:
+        entry.file.attrs["default"] = entry.name
+        entry.file.copy(entry, "entry0001")
+
+    path = nxtomo(tmp_path / "s.nx", also=second)
+    (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
+    other = f"/entry0001/{DETECTOR}/data"
+    assert hit.severity == "warning" and f"--data-path {other}" in hit.message
+    with open_scan(SourceOptions(path, data_path=other)) as source:
+        assert source.not_used == ()
+
+
+def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path) -> None:
+    kev = np.r_[np.nan, 20.0, [20, 30, 20, 30, 20]]
+    path = nxtomo(tmp_path / "s.nx", ("instrument/beam/incident_energy", kev, "keV"))
+    (hit,) = [hit for hit in validate(path) if hit.rule == "energies"]
+    assert hit.severity == "error" and "3 at 20 keV, 2 at 30 keV" in hit.message
+    with open_scan(SourceOptions(path, frames="energy=20", darks=FRAMES[:2])) as source:
+        assert source.energy_kev == 20
+        assert source.image_key.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
+    assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
+    with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
+        open_scan(SourceOptions(path, frames="energy=25"))
+    with pytest.raises(DataError, match="states no energy of each frame"):
+        open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))

@@ -95,5 +95,5 @@ def test_few_views_and_views_without_matter_are_refused() -> None:
     few = _start().select(slice(11))
     with pytest.raises(ValueError, match="11 views"):
         learn_geometry(np.ones((11, *SHAPE), np.float32), few, PLACES)
-    with pytest.raises(ValueError, match="no matter"):
+    with pytest.raises(ValueError, match="no absorbing sample"):
         learn_geometry(np.zeros((VIEWS, *SHAPE), np.float32), _start(), PLACES)

@@ -27,7 +27,7 @@ def toy(seed: int = 0) -> tuple[Emission, Grid, np.ndarray]:
     activity = rng.uniform(5, 40, grid.shape).astype(F32) * (rng.random(grid.shape) < 0.6)
     shape = (16, 2, 7)
     survival, background = rng.uniform(0.3, 0.9, shape).astype(F32), rng.uniform(1, 4, shape).astype(F32)
-    projector = Projector(geometry, grid)
+    projector = Projector(geometry, grid).plain
     counts = rng.poisson(survival * projector.forward(activity) + background).astype(F32)
     unit = np.eye(activity.size, dtype=F32).reshape(-1, *grid.shape)
     return (
@@ -68,7 +68,7 @@ def test_without_background_each_iteration_keeps_the_counts() -> None:
     emission, grid, _ = toy(2)
     plain = Emission(emission.counts, emission.geometry, emission.survival)
     for n in (1, 2, 7):
-        mean = emission.survival * Projector(emission.geometry, grid).forward(mlem(plain, grid, n).data)
+        mean = emission.survival * Projector(emission.geometry, grid).plain.forward(mlem(plain, grid, n).data)
         assert mean.sum() == pytest.approx(emission.counts.sum(), rel=1e-4)
 
 
@@ -89,7 +89,7 @@ def test_what_is_given_makes_activity_right_and_what_is_left_out_shows() -> None
     """Mean of cold rods over background (spillover) below 5 %, hot rod within 5 %; with noise of 10⁶ counts."""
     activity, mu, geometry = phantom()
     survival = attenuation_factors(mu, geometry)
-    true = survival * Projector(geometry, activity.grid).forward(activity.data)
+    true = survival * Projector(geometry, activity.grid).plain.forward(activity.data)
     scale = 1e6 / float(true.sum())
     background = np.full_like(true, 0.25 * scale * true.mean())
     counts = np.random.default_rng(0).poisson(scale * true + background).astype(F32)
@@ -109,7 +109,7 @@ def test_what_is_given_makes_activity_right_and_what_is_left_out_shows() -> None
 
 def test_subsets_reach_in_one_iteration_what_takes_as_many_without() -> None:
     activity, _, geometry = phantom()
-    counts = Projector(geometry, activity.grid).forward(activity.data) * 1000
+    counts = Projector(geometry, activity.grid).plain.forward(activity.data) * 1000
     plain, ordered = (mlem(Emission(counts, geometry), activity.grid, n, m).data / 1000 for n, m in ((20, 1), (2, 10)))
     assert np.sqrt(np.mean((plain - ordered) ** 2)) < 0.05
     assert np.sqrt(np.mean((ordered - activity.data) ** 2)) < 0.35
@@ -122,7 +122,7 @@ def test_counts_held_out_end_the_iterations_where_the_volume_is_nearest_to_the_t
     """More counts take more of them. Half as many and twice as many are no nearer, and FBP is farther away."""
     activity, mu, geometry = phantom()
     survival = attenuation_factors(mu, geometry)
-    lines = survival * Projector(geometry, activity.grid).forward(activity.data)
+    lines = survival * Projector(geometry, activity.grid).plain.forward(activity.data)
     scale = total / float(lines.sum())
     background = np.full_like(lines, 0.25 * scale * lines.mean())
     counts = np.random.default_rng(0).poisson(scale * lines + background).astype(F32)

@@ -162,7 +162,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
         ignored = prepare_projections(
             source, replace(selection, steps=(PosesOfFile(read_poses("ignore")),)), pytest.fail
         )
-        with pytest.raises(ConfigError, match="--tilt turns views"):
+        with pytest.raises(ConfigError, match="--tilt and --poses both"):
             prepare_projections(source, replace(selection, steps=(TiltAndLens(1.0),)), said.append)
     np.testing.assert_allclose(displaced.geometry.shifts, np.stack([-back, 0 * back], axis=1))
     assert "120 poses" in said[0] and "4 px (columns)" in said[0]

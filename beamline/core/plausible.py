@@ -1,0 +1,64 @@
+"""Plausible: values that a unit mistaken by a factor makes, which every type accepts and no instrument has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+_SAME = 1e-3  # share by which an angle may be off half a turn or a turn in radians
+
+
+@dataclass(frozen=True)
+class PlausibleRange:
+    """Values that instruments have.
+
+    Attributes:
+        others: units that are mistaken for this one, with what a number of them is in this one.
+    """
+
+    low: float
+    high: float
+    unit: str
+    others: Mapping[str, float]
+
+
+RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
+    {
+        "pixel_size_um": PlausibleRange(0.05, 500.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
+        "energy_kev": PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3}),
+        "distance_mm": PlausibleRange(0.0, 2e4, "mm", {"um": 1e-3, "nm": 1e-6}),
+        "exposure_s": PlausibleRange(1e-6, 600.0, "s", {"ms": 1e-3, "us": 1e-6}),
+    }
+)
+"""By name: from pixels behind X-ray lenses to those of flat panels, from carbon's edge to tubes of 600 kV, the longest
+hutches, and the longest exposures that a ring lasts."""
+
+
+def doubt(name: str, value: float | None) -> str:
+    """A sentence on a value beyond any instrument, by its name in RANGES, with what may be meant; empty: it may be."""
+    known = RANGES[name]
+    if value is None or known.low <= value <= known.high or not value > 0:
+        return ""
+    ratio = value / known.high if value > known.high else known.low / value
+    orders = max(1, math.ceil(math.log10(ratio) - 1e-9))
+    meant = [
+        f"{value * factor:.4g} {known.unit} ({value:.6g} {other})"
+        for other, factor in known.others.items()
+        if known.low <= value * factor <= known.high
+    ]
+    beyond = f"{orders} order{'s' * (orders > 1)} of magnitude beyond instruments of this kind"
+    asked = f": did you mean {' or '.join(meant)}?" if meant else "."
+    return f"{name}: {value:.6g} {known.unit} is {beyond} ({known.low:g} to {known.high:g} {known.unit}){asked}"
+
+
+def doubt_span(span_deg: float | None) -> str:
+    """A sentence on a span of angles that is half a turn or a turn in radians; empty: it is not."""
+    for turn in (math.pi, 2 * math.pi):
+        if span_deg is not None and abs(abs(span_deg) / turn - 1) < _SAME:
+            return (
+                f"span_deg: {span_deg:g} degrees is {math.degrees(turn):.0f} degrees in radians: did you mean "
+                f"{math.copysign(math.degrees(turn), span_deg):.0f}?"
+            )
+    return ""

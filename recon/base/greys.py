@@ -1,0 +1,88 @@
+"""grey_windows: ranges of grey values that separate the classes of a volume (air, matrix, dense matter)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SAMPLE = 200_000  # values that are looked at
+_SPLIT = 0.7  # share of the variance that two classes explain; halves of one normal distribution explain 0.64
+_LEAST = 2e-4  # share of the values that a class has at least
+_MOST = 8  # classes
+_FREQUENT = 0.03  # share of all matter
+_METAL, _RARER = 4.0, 0.75  # times as dense as the matter below it, and as frequent: white, or that matter is black
+_WEAK = 0.6  # of the end of the window of matter
+_BEYOND = 0.1  # of the window, below air and above the densest class shown
+_DARKER, _BRIGHTER = 2.0, 98.0  # percentiles of a class that still belong to the window
+_ALL = (0.05, 99.95)
+
+
+def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+    """Some of the finite values, in ascending order, parted into classes by thresholds between them.
+
+    A class is parted where two of its parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man
+    Cybern. 9, 62), and each of these likewise.
+    """
+    flat = np.asarray(values).reshape(-1)
+    flat = np.sort(flat[:: max(1, flat.size // _SAMPLE)])
+    flat = flat[np.isfinite(flat)].astype(np.float64)
+    least = max(4, round(_LEAST * flat.size))
+    classes, splits = [flat], [_split(flat, least)]
+    while len(classes) < _MOST and max(gain for gain, _ in splits) > 0:
+        at = max(range(len(splits)), key=lambda k: splits[k][0])
+        place = splits[at][1]
+        parts = [classes[at][:place], classes[at][place:]]
+        classes[at : at + 1], splits[at : at + 1] = parts, [_split(part, least) for part in parts]
+    return classes
+
+
+def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
+    """The sum of squares that two classes explain, and the values in the lower one; 0: they are one class."""
+    n = ascending.size
+    places = least + np.flatnonzero(ascending[least : n - least + 1] > ascending[least - 1 : n - least])
+    if n < 2 * least or not places.size:
+        return 0.0, 0
+    centred = ascending - ascending.mean()
+    lower = np.cumsum(centred)[places - 1]
+    between = lower**2 / places + lower**2 / (n - places)  # the sum of all is 0
+    best = int(between.argmax())
+    gain = float(between[best])
+    return (gain, int(places[best])) if gain > _SPLIT * float(centred @ centred) else (0.0, 0)
+
+
+def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]:
+    """Ends of grey windows of a volume by their names, the first one first.
+
+    "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen, "weak",
+    where it differs, to the least dense class. "all" holds all values but the last half per mille at each end.
+    """
+    classes = [each for each in class_levels(values) if each.size]
+    if not classes:
+        return {"matter": (0.0, 1.0), "all": (0.0, 1.0)}
+    frequent = _FREQUENT * sum(each.size for each in classes[1:])  # the others are edges between matter
+    matter = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
+    levels, sizes = [float(np.median(each)) for each in matter], [each.size for each in matter]
+    far = len(levels) > 2 and levels[-1] - levels[0] > _METAL * (levels[-2] - levels[0])
+    top = len(levels) - 1 - (far and sizes[-1] < _RARER * sum(sizes[1:-1]))
+
+    def window(top: int) -> tuple[float, float]:
+        low, high = float(np.percentile(matter[0], _DARKER)), float(np.percentile(matter[top], _BRIGHTER))
+        if top > 0:
+            low = max(low, levels[0] - _BEYOND * (high - levels[0]))
+        return apart(low, high + _BEYOND * (high - levels[top]))
+
+    windows = {"matter": window(top)}
+    if top > 1 and (weak := window(1))[1] < _WEAK * windows["matter"][1]:
+        windows["weak"] = weak
+    low, high = np.percentile(np.concatenate(classes), _ALL).tolist()
+    return windows | {"all": apart(low, high)}
+
+
+def matter_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
+    """The first of `grey_windows` of all these values together."""
+    return grey_windows(np.concatenate([np.ravel(array) for array in arrays]))["matter"]
+
+
+def apart(low: float, high: float) -> tuple[float, float]:
+    """These ends, apart also where all values are equal."""
+    return low, max(high, low + 1e-6 * max(abs(low), 1e-3))

@@ -1,0 +1,72 @@
+"""No false alarm: 200 random scans at rest, of one light, break no law; the same with a fault break one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from tests.beamline.array_source import ArraySource
+from tests.recon.prep.balls import Balls
+
+LAWS = "mass", "centre of mass", "higher or lower", "turn", "as the flats", "noise of the views", "scaled by itself"
+
+
+def random_scan(seed: int, angles_of: object = None, factor_of: object = None) -> ArraySource:
+    """Size, noise, sample, hardening, order, drift of the beam and turn are random."""
+    rng = np.random.default_rng(seed)
+    n, shape = int(rng.integers(45, 160)), (int(rng.integers(8, 32)), int(rng.integers(48, 112)))
+    angles = np.linspace(0, rng.choice([np.pi, 2 * np.pi]), n, endpoint=False)
+    true = angles if angles_of is None else angles_of(angles)  # type: ignore[operator]
+    axis_col = shape[1] / 2 + rng.uniform(-2, 2)
+    balls = Balls(true, shape, axis_col, seed=seed, count=int(rng.integers(2, 30)))
+    lines = balls.views().astype(np.float64)
+    lines *= rng.uniform(0.7, 2.5) / lines.max()
+    lines *= 1 - rng.uniform(0, 0.12) * lines / lines.max()  # hardening
+    if factor_of is not None:
+        lines *= factor_of(np.arange(n) / n)[:, None, None]  # type: ignore[operator]
+    light = np.linspace(1, rng.uniform(0.8, 1.15), n)[:, None, None] * 10 ** rng.uniform(2.8, 4.5)
+    order = rng.permutation(n) if rng.random() < 0.2 else np.arange(n)
+    beam, start = np.ones((8, *shape)), light[0]
+    counts = [rng.poisson(0 * beam), rng.poisson(start * beam), rng.poisson(light * np.exp(-lines[order]))]
+    data = np.concatenate(counts) + rng.normal(100, 1.5, (n + 16, *shape))
+    keys = [2] * 8 + [1] * 8 + [0] * n
+    scan = ArraySource(
+        np.clip(np.round(data), 0, 65535).astype(np.uint16), keys, np.concatenate([np.full(16, np.nan), angles[order]])
+    )
+    scan.axis_col = axis_col
+    return scan
+
+
+def told(scan: ArraySource) -> list[str]:
+    sentences: list[str] = []
+    prepare_projections(scan, Selection(axis_col=scan.axis_col), sentences.append)  # type: ignore[arg-type]
+    return [sentence for sentence in sentences if any(law in sentence for law in LAWS)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 200, 25))
+def test_scans_at_rest_break_no_law(first: int) -> None:
+    assert {seed: said for seed in range(first, first + 25) if (said := told(random_scan(seed)))} == {}
+
+
+@pytest.mark.parametrize(
+    ("factor_of", "words"),
+    [
+        (lambda t: 1 - 0.3 * t, "evenly, by -"),
+        (lambda t: np.where(t < 0.5, 1, 0.5), "from frame"),
+        (lambda t: np.where(np.arange(t.size) % 2, 0.5, 1.0), "in turn"),
+    ],
+)
+def test_a_mass_that_changes_is_told_with_its_way(factor_of: object, words: str) -> None:
+    (sentence,) = told(random_scan(1, factor_of=factor_of))
+    assert sentence.startswith("The mass of the views changes by ")
+    assert words in sentence
+
+
+@pytest.mark.parametrize("by_deg", [20.0, 40.0])
+def test_views_that_are_late_are_told_with_their_frames(by_deg: float) -> None:
+    late = lambda angles: angles + np.radians(by_deg) * (angles > angles[-1] / 2)  # noqa: E731
+    (sentence,) = told(random_scan(1, angles_of=late))
+    assert sentence.startswith("Beside their angles the views seem to be turned by up to ")
