@@ -29,6 +29,11 @@ from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 
+BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
+SAMPLES = 4  # frames of a kind that tell where the detector saturates
+PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
+POLL = 0.1  # s between looks at a growing file
+
 
 @dataclass(frozen=True)
 class SkippedChecks:
@@ -68,12 +73,6 @@ class SkippedChecks:
             ("mass", self.wider, "sample wider than the field"),
         )
         return tuple(f"{checks} in {n} of {self.views} views ({why})" for checks, n, why in reasons if n)
-
-
-BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
-SAMPLES = 4  # frames of a kind that tell where the detector saturates
-PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
-POLL = 0.1  # s between looks at a growing file
 
 
 @dataclass(frozen=True, eq=False)

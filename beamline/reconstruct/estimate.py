@@ -92,7 +92,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
             fit_truth(truth, Grid.matching(needs.geometry), options.selection.binning)
         plan = planned(source, options, needs)
     method, geometry = plan.needs.method, plan.needs.geometry
-    options.target.require_room(plan.output, plan.scratch + plan.line_integrals)
+    options.target.require_room(plan.output, plan.scratch)
     shape, several = Grid.matching(geometry).shape, volumes_of(method)
     missing = plan.missing if plan.slabs else slabs_of(shape[0], shape[0], 0)
     span = _span(options, method, geometry, missing, rates)
@@ -105,7 +105,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
         memory=plan.memory,
         slabs=len(missing),
         done=_slices(plan.slabs) - _slices(plan.missing),
-        scratch=plan.scratch + plan.line_integrals,
+        scratch=plan.scratch,
         output=plan.output,
         free=shutil.disk_usage(options.target.output.parent).free,
         seconds=None if span is None else span.most,

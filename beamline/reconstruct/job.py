@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import DataError
-from beamline.core.events import Sink, StateEntered
+from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
+from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
@@ -21,7 +22,6 @@ from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
-from beamline.reconstruct.progress import compilation_events, progress_events
 from beamline.reconstruct.region import RegionOfRows
 from beamline.reconstruct.run import run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
@@ -46,6 +46,50 @@ from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.last_round import LastRound
 from recon.warm_up import warm_up
+
+
+def progress_events(
+    sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
+) -> Callable[[Progress], None]:
+    """A listener that passes progress on as events, with `per_s` (steps) and `eta_s`; None where they are not known.
+    `seconds`: time of the fit, if no number of steps is planned. `waiting`: views that it has not learnt yet.
+    """
+    first: Progress | None = None
+    step = 0
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal first, step
+        if first is None or progress.step < step:  # a followed scan's fit may begin anew
+            first = progress
+        step = progress.step
+        made, spent = progress.step - first.step, progress.seconds - first.seconds
+        rate = made / spent if made > 0 and spent > 0 else None
+        eta = None
+        if progress.steps:
+            eta = seconds_left(made, progress.steps - first.step, spent)
+        elif seconds is not None and not progress.unit:
+            eta = max(0.0, seconds - spent)
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=eta, waiting=waiting(), time=clock.now()))
+
+    return on_progress
+
+
+def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
+    """A listener that passes the number of kernels compiled so far on as events."""
+    begin = clock.now()
+
+    def compiled(n: int) -> None:
+        now = clock.now()
+        sink(KernelsCompiled("kernels", n, now - begin, time=now))
+
+    return compiled
+
+
+def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
+    """Report what each correction did to the views; "" is not reported."""
+    for state, message in messages.items():
+        if message:
+            sink(StateEntered(state, message, time=clock.now()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,8 @@ from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, EnoughViews, FollowedViews, FollowState, report_gain
+from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock

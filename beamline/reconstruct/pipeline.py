@@ -18,19 +18,25 @@ from beamline.projections.held_out import hold_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.error_bars import refuse_views
 from beamline.reconstruct.in_time import fit_within, warnings_told
-from beamline.reconstruct.job import Channels, Job, compile_kernels, volume_of, with_error_bars
+from beamline.reconstruct.job import (
+    Channels,
+    Job,
+    compilation_events,
+    compile_kernels,
+    corrections_done,
+    volume_of,
+    with_error_bars,
+)
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.outcome import ReportContext, ScanFacts, facts_of
-from beamline.reconstruct.plan import ReconPlan
-from beamline.reconstruct.progress import compilation_events, corrections_done
+from beamline.reconstruct.plan import ReconPlan, prepare_within
 from beamline.reconstruct.refusals import refuse_before_reading
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.remarks import partly_seen_warning
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import keeping
-from beamline.reconstruct.slabs import prepare_within
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.recon_record import ReconRecord
@@ -43,7 +49,8 @@ from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
-MOST_SECONDS = 600.0  # of the last round
+MOST_SECONDS = 1800.0  # of the last round
+_HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 
 @contextmanager
@@ -152,9 +159,6 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
         follower.ask_whether_enough()
 
 
-_HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
-
-
 @contextmanager
 def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
     """The job of a scan whose views are all there, with compiled kernels; slabs stay where the block fails.
@@ -217,7 +221,7 @@ def _for_method(
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
-    options.target.require_room(plan.output, plan.scratch)
+    options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # these are there
     return prepared
 
 

@@ -8,15 +8,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from beamline.core.errors import DataError
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Counted, Sink, StateEntered
+from beamline.core.machine_speed import seconds_left
+from beamline.core.need import Need
+from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
 from beamline.core.text import size
-from beamline.projections.prepare import refuse_spilled
+from beamline.projections.prepare import DiskBuffer, prepare_projections, refuse_spilled
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import cone_of
 from beamline.reconstruct.error_bars import refuse_views
 from beamline.reconstruct.memory import (
     ReconMemory,
     memory_of,
+    recon_memory_of,
     refuse_few_views,
     refuse_slabs,
     refuse_smallest,
@@ -25,15 +33,21 @@ from beamline.reconstruct.memory import (
 )
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import Region, locate
+from beamline.reconstruct.several_scans import SeveralScans, views_of_others, with_as_many_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
+from drivers.base.clock import Clock
+from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 
+_BATCH = 0.25  # of the memory: views during correction
 
-@dataclass(frozen=True)
-class ReconPlan:
+
+@dataclass(frozen=True, kw_only=True)
+class ReconPlan(Need):
     """How a reconstruction uses memory and disk.
 
     Attributes:
@@ -41,20 +55,12 @@ class ReconPlan:
         allowed: bytes of memory that may be used.
         slabs: in which the volume is made; none: at once.
         missing: those that a partial volume lacks; all without one.
-        output, scratch: bytes on the disk for the result, and beside it while it is made.
     """
 
     needs: ReconMemory
     allowed: int
     slabs: Sequence[Slab]
     missing: Sequence[Slab]
-    output: int
-    scratch: int
-
-    @property
-    def memory(self) -> int:
-        """Bytes that are used."""
-        return max(self.needs.slab(self.slabs[0].own.stop), self.needs.least) if self.slabs else self.needs.at_once
 
     @property
     def line_integrals(self) -> int:
@@ -165,4 +171,62 @@ def _plan(
     missing: Sequence[Slab] = (),
 ) -> ReconPlan:
     output, scratch = options.disk_needs(needs.volume, in_slabs=bool(slabs))
-    return ReconPlan(needs, allowed, slabs, missing, output, scratch)
+    return ReconPlan(
+        memory=max(needs.slab(slabs[0].own.stop), needs.least) if slabs else needs.at_once,
+        output=output,
+        scratch=scratch + needs.line_integrals * bool(slabs),
+        needs=needs,
+        allowed=allowed,
+        slabs=slabs,
+        missing=missing,
+    )
+
+
+def prepare_within(
+    source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
+) -> tuple[PreparedProjections, ReconPlan]:
+    """As `prepare_projections`, and the plan: of a volume in slabs line integrals lie on disk."""
+    began, selection = clock.now(), options.selection
+
+    def progress(n: int, total: int) -> None:
+        now = clock.now()
+        spent = max(now - began, 1e-9)
+        sink(Counted("correction", n, total, n / spent, seconds_left(n, total, spent) or 0.0, time=now))
+
+    try:
+        needs = recon_memory_of(source, options)
+    except (ConfigError, DataError):
+        prepare_projections(source, selection, warn)  # faults of the views come first: this says them
+        raise
+    plan, buffer = planned(source, options, needs), None
+    options.target.require_room(plan.output, plan.scratch)
+    if plan.slabs:
+        sentence = (
+            f"All at once would take {size(needs.at_once)}, but {size(plan.allowed)} of memory may be used: working in "
+            f"slabs, with {size(needs.line_integrals + needs.volume)} of scratch files on the output's disk."
+        )
+        sink(StateEntered("memory", sentence, time=clock.now()))
+        batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
+        shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
+        buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch, progress)
+    others = views_of_others(options.source, selection)
+
+    def check(geometry: Geometry) -> None:
+        refuse_geometry(source, options, plan, with_as_many_views(geometry, geometry.n_views + others))
+
+    if isinstance(options.source, SeveralScans):
+        return options.source.prepare(selection, warn, check, phases), plan
+    prepared = prepare_projections(source, selection, warn, buffer, check, phases)
+    if options.method.traits.in_time:
+        prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
+    return prepared, of_views(source, options, plan, prepared)
+
+
+def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
+    """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
+    seconds = source.times
+    if seconds is not None and np.isfinite(seconds[view_ids]).all():
+        return np.asarray(seconds[view_ids], np.float64)
+    period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
+    warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
+    return np.asarray(view_ids * float(period), np.float64)

@@ -26,7 +26,7 @@ from beamline.core.files import is_link, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
 from beamline.storage.structure import require_harmless
-from beamline.storage.superblock import superblock
+from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
 DEGREE = np.pi / 180
@@ -73,27 +73,19 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
-    problems, is_held = [], False
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):
         return _apart(path, follow)
-    missing = 0 if head is None else head.missing
-    being_written = head is not None and head.open_for_writing and head.intact
-    # A follower takes no lock, so as not to be taken for a writer.
-    growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
-    tries = [growing, whole, shared] if follow else [whole, growing, shared]
-    for swmr, locking in tries:
-        if swmr and (missing or not (follow or being_written)):
-            continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    problems = []
+    for swmr, locking in _ways(head, follow):
         try:
             if swmr:
                 file = h5py.File(path, "r", swmr=swmr, locking=locking)
             else:
-                file = opened_whole(path, unlocked=not being_written)
+                file = opened_whole(path, unlocked=not _being_written(head))
         except (OSError, ValueError) as error:
-            problems.append(str(error))
-            is_held = is_held or lock_failure(error) is LockFailure.HELD
+            problems.append(error)
             continue
         try:
             with readable(path):
@@ -102,21 +94,40 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             file.close()
             raise
         return file
+    raise _unopened(path, follow, head, problems)
+
+
+def _being_written(head: Superblock | None) -> bool:
+    return head is not None and head.open_for_writing and head.intact
+
+
+def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None]]:
+    """Ways to open a file, (swmr, locking), in the order in which they are tried."""
+    # A follower takes no lock, so as not to be taken for a writer.
+    growing, whole, shared = (True, False), (False, None), (True, None)
+    ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
+    # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    waits = (head is not None and head.missing) or not (follow or _being_written(head))
+    return [way for way in ways if not (way[0] and waits)]
+
+
+def _unopened(path: Path, follow: bool, head: Superblock | None, problems: list[OSError | ValueError]) -> DataError:
+    """Why none of the ways opened a file."""
     if follow:
-        raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
-    if missing:
-        raise DataError(
-            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If the disk "
-            "was full, `beamline recover` rescues its frames. Nothing was read."
+        return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
+    if head is not None and head.missing:
+        return DataError(
+            f"{path} is cut off: the last {head.missing} bytes are missing. Copy it again, or use the original. If the "
+            "disk was full, `beamline recover` rescues its frames. Nothing was read."
         )
-    if being_written:
-        raise DataError(
+    if _being_written(head):
+        return DataError(
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
             "writer died, `beamline recover` clears the mark; nothing was read."
         )
-    if is_held:
-        raise DataError(held_sentence(path))
-    raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
+    if any(lock_failure(error) is LockFailure.HELD for error in problems):
+        return DataError(held_sentence(path))
+    return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 
 def grows_here(path: Path) -> bool:
@@ -141,7 +152,7 @@ def _open_by_name() -> dict[int, Any]:
 
 @contextmanager
 def opened_itself(path: Path) -> Iterator[None]:
-    """What the block opens by this name is the regular file of the name, and not what a link led to meanwhile.
+    """Check that the block opened the regular file of this name, and not the target of a link that replaced it.
 
     For files in another user's folder, as HDF5 opens by name. On Windows, where its handles cannot be looked at, a link
     that still stands there is found.
@@ -168,7 +179,7 @@ def _apart(path: Path, follow: bool) -> h5py.File:
     """The file by a driver that HDF5 shares with no other."""
     head = superblock(path)
     if head is None or not head.intact or (head.open_for_writing and not head.grows):
-        raise (NotReadyError if follow else DataError)(f"{path} is just being made by this program. Try again.")
+        raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
     with readable(path):
         return h5py.File(GrowingFile(path, head), "r")
 
@@ -267,7 +278,7 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
 
 @contextmanager
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
-    """A new file. At the end of the block it is on the disk, and was read back and compared with what was written.
+    """Create a file. At the end of the block it is on the disk, read back and compared.
 
     Raises:
         OSError: the disk refused the bytes or holds others; the file is closed and stays.
@@ -278,7 +289,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
 
 @contextmanager
 def changed(path: Path) -> Iterator[NewFile]:
-    """An existing file, open to be changed, as by `created`; what is changed when the disk refuses stays half done."""
+    """Open an existing file to change it, as `created` does; a disk error leaves the changes half done."""
     with _written(path, "r+", None) as file:
         yield file
 
@@ -340,7 +351,7 @@ def text_of(item: h5py.Dataset) -> str:
 
 
 def is_foreign(item: h5py.Dataset) -> bool:
-    """Text behind a link in a file that holds no images: a scan has no business with it, and its reader shows it."""
+    """Whether a text is behind a link in a file without images: no scan needs it, and its reader would print it."""
     if item.dtype.kind in "uifb":
         return False
     if item.is_virtual:
@@ -363,7 +374,7 @@ _HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's
 
 
 def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Every dataset that may be images, once, also behind links."""
+    """Each dataset that may hold images, once, also behind links."""
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -428,7 +439,7 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 
 def broken_link(group: h5py.Group, path: str) -> str:
-    """Where a path ends at a link that leads nowhere, and where that should lead; "" for a path that is not there."""
+    """A sentence if a path ends at a broken link, with the link's target; "" if not."""
     here: Any = group
     for name in path.strip("/").split("/"):
         if not isinstance(here, h5py.Group):
@@ -442,7 +453,7 @@ def broken_link(group: h5py.Group, path: str) -> str:
 
 
 def refuse_broken(group: h5py.Group, path: str) -> None:
-    """Raises DataError where a path ends at a link that leads nowhere."""
+    """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
         raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
 
@@ -482,7 +493,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
         )
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
     if lost := missing_links(item):
-        raise DataError(f"{item.file.filename} draws its angles from {lost[0]}, which is not there or differs.")
+        raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
     return np.ravel(np.asarray(values_of(item), np.float64)) * factor
 
 
@@ -498,7 +509,7 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 
 
 def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
-    """Files, and datasets of its own file, that a virtual dataset draws on and that cannot be read, or differ in shape.
+    """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
     Virtual sources are followed through `within` files at most.

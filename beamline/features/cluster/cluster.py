@@ -35,6 +35,10 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 _NAME = "slurm"
+_CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
+_PATIENCE = 60.0  # s that work goes without any worker
+LOOK_EVERY = 2.0  # s between two checks for a worker
+_TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
 
 
 def _text(value: Any) -> Any:
@@ -165,12 +169,6 @@ def submitted(jobs: SlurmJobs) -> Iterator[Any]:
             raise RuntimeError(refusal)
         cluster.scale(jobs=jobs.jobs)
         yield cluster
-
-
-_CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
-_PATIENCE = 60.0  # s that work goes without any worker
-LOOK_EVERY = 2.0  # s between two checks for a worker
-_TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
 
 
 class WorkersLostError(BeamlineError):

@@ -43,6 +43,9 @@ PIECE = 16 << 20  # Bytes that are written and synchronised together
 LEAST = 4 * PIECE  # Fewer bytes give no reliable rate
 COMFORT = 1.25  # A disk faster than the need by this factor is good; a slower one may be disturbed by other programs
 SPEED, ROOM, LOCKS = "disk speed", "disk space", "file locks"
+Opens = Callable[[Path], IO[bytes]]
+"""Opens a new file in a folder; the file is removed when it is closed or the process ends."""
+_MEMORY, _RATE = "memory", "frame rate"
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,6 @@ class Measured:
     @property
     def rate(self) -> float:
         return self.n_bytes / max(self.seconds, 1e-9)  # a clock may be coarse
-
-
-Opens = Callable[[Path], IO[bytes]]
-"""Opens a new file in a folder; the file is removed when it is closed or the process ends."""
 
 
 def temporary(folder: Path) -> IO[bytes]:
@@ -188,9 +187,6 @@ def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
     if free < 2 * needs.file_bytes:
         return Diagnosis(ROOM, Grade.WARNING, observed, expected, "Free some space before the next scan", values)
     return Diagnosis(ROOM, Grade.OK, observed, expected, values=values)
-
-
-_MEMORY, _RATE = "memory", "frame rate"
 
 
 def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Diagnosis]:

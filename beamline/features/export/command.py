@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 
 VIEWS, AXES = "views", "zyx"
 SUFFIXES = (".gif", ".mp4")
+_PLY, _CSV = ".ply", ".csv"
+_SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
 
 
 def export_film(of: str, file: Path, output: Path, style: FilmStyle, dataset: tuple[str | None, int | None],
@@ -108,10 +110,6 @@ def window_of(text: str) -> tuple[float, float]:
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(f"{text!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
     return low, high
-
-
-_PLY, _CSV = ".ply", ".csv"
-_SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
 
 
 def _output_path(text: str) -> Path:

@@ -26,6 +26,8 @@ from beamline.storage.volumes.files import opened_volume, times_of, volume_forma
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
 
+Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
+
 
 def volume_findings(record: ReconRecord) -> Iterator[Finding]:
     """What the rules find in a volume; every slice of it is read."""
@@ -52,9 +54,6 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         yield Finding("info", "voxel-size", "No voxel size in mm: lengths are in voxels.")
     if record.parameters and not Path(record.raw_file).exists():
         yield Finding("info", "raw-file", f"The scan that it was made from, {record.raw_file}, is not there.")
-
-
-Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:

@@ -35,7 +35,7 @@ from beamline.projections.held_out import hold_out, with_views_held_out
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import Light
 from beamline.reconstruct.outcome import facts_of
-from beamline.reconstruct.slabs import times_of
+from beamline.reconstruct.plan import times_of
 from drivers.base.clock import Clock
 from recon.base.arrays import F32
 from recon.base.volume import Grid

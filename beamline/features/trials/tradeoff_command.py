@@ -159,14 +159,9 @@ def tradeoff(request: TradeoffRequest) -> None:
         scans = None
         if request.spectra is not None:
             scans = EnergyScans((source, *(each for each, _ in others)), read_spectra(request.spectra))
+        light = light_asked(request.values["photons_per_count"], request.values["dose_in"])
         options = TradeoffOptions(
-            scan=ComparedScan(
-                source,
-                selection,
-                folder,
-                request.truth,
-                light_asked(request.values["photons_per_count"], request.values["dose_in"]),
-            ),
+            scan=ComparedScan(source, selection, folder, request.truth, light),
             methods=request.methods or (),
             several=SeveralVolumes(request.volumes or 0, scans, names_in(request.states)),
             depth="quick" if request.quick else "full",

@@ -28,6 +28,26 @@ REACH = 6  # cells of a window to either side of its middle
 FREQUENCIES = 120  # up to Nyquist, over which the covariance is summed
 ROUGHNESS = 0.05  # cycles-of-2-pi a cell below which the sample's spectrum is flat; above it falls as its third power
 CONSTANT = 1.0  # variance of constant differences: rings, flats that do not fit
+COLUMNS = 32  # broad columns of the field
+PARTS = 8  # of the rows
+MOST_PARTS = 25.0  # percentile of the parts that must have the change
+ALIKE = 0.25  # share of the mean: a ghost is as high as the frame, a floater is only in some parts
+LAGS = (-4, -3, -2, -1, 0)  # times the stride
+SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
+MOST_STRIDE = 3
+WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
+CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first light in the field to its last
+STRUCTURE, COMMON = 0.3, 0.05**2
+MARGIN = 1.2
+WIDER = 2.2  # as for a floater
+FASTER = 1.3
+SHOWS = 4.0  # standard deviations that a hump at the limit must reach, or its filter is left out
+CALIBRATION = 24  # views
+LEAST_NOISE = 3e-4
+MEMORY, OUTLIER = 0.03, 3.0
+PEAK = 5.0
+SPAN, LEAST, SHARE = 10, 4, 0.6  # views that a trail takes at most, has a peak in at least, and what share has one
+OFF, SLACK = 2.5, 0.15  # broad columns: from a peak to its trail; a view, added to the sample's speed
 
 
 @dataclass(frozen=True)
@@ -102,28 +122,6 @@ def correlate(views, weights, out):
                     total += w[4] * wide[i + 4] + w[5] * wide[i + 5] + w[6] * wide[i + 6] + w[7] * wide[i + 7]
                     total += w[8] * wide[i + 8] + w[9] * wide[i + 9] + w[10] * wide[i + 10] + w[11] * wide[i + 11]
                     target[i] += total + w[12] * wide[i + 12]
-
-
-COLUMNS = 32  # broad columns of the field
-PARTS = 8  # of the rows
-MOST_PARTS = 25.0  # percentile of the parts that must have the change
-ALIKE = 0.25  # share of the mean: a ghost is as high as the frame, a floater is only in some parts
-LAGS = (-4, -3, -2, -1, 0)  # times the stride
-SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
-MOST_STRIDE = 3
-WIDTHS = (1 / 7, 1 / 3.5)  # half width of the hump's foot, of the field
-CROSSINGS = (8, 14, 24, 40, 70)  # views from the hump's first light in the field to its last
-STRUCTURE, COMMON = 0.3, 0.05**2
-MARGIN = 1.2
-WIDER = 2.2  # as for a floater
-FASTER = 1.3
-SHOWS = 4.0  # standard deviations that a hump at the limit must reach, or its filter is left out
-CALIBRATION = 24  # views
-LEAST_NOISE = 3e-4
-MEMORY, OUTLIER = 0.03, 3.0
-PEAK = 5.0
-SPAN, LEAST, SHARE = 10, 4, 0.6  # views that a trail takes at most, has a peak in at least, and what share has one
-OFF, SLACK = 2.5, 0.15  # broad columns: from a peak to its trail; a view, added to the sample's speed
 
 
 class Peak(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from beamline.core.events import Event
-from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.job import progress_events
 from drivers.base.clock import SystemClock
 from recon.base.method import Progress
 

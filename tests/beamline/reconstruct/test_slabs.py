@@ -54,7 +54,7 @@ def test_the_volume_is_the_same_to_the_bit(tmp_path: Path, memory: str, more: li
     whole = volume(*more, "--memory", "1G", "-o", "whole.h5")
     result = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", *more, "--memory", memory, "-o", "parts.h5")
     assert result.exit_code == 0, result.output
-    assert "lie on the disk" in result.stderr and "slices" in result.stderr
+    assert "scratch files" in result.stderr and "slices" in result.stderr
     parts = read_reconstruction(Path("parts.h5"))
     np.testing.assert_array_equal(parts.volume.data, whole)
     other = read_reconstruction(Path("whole.h5"))
@@ -135,7 +135,7 @@ def test_slabs_take_no_more_memory_than_was_given(
         peak = tracemalloc.get_traced_memory()[1] - before
     finally:
         tracemalloc.stop()
-    assert result.exit_code == 0 and "lie on the disk" in result.stderr, result.output
+    assert result.exit_code == 0 and "scratch files" in result.stderr, result.output
     assert peak < 1e6 * memory
 
 

@@ -25,6 +25,23 @@ HOLLOW, CRACK = 0.5, (0.95, 0.06)
 """Size of a pore over the grain's; radius and half width of a crack over the inscribed sphere's radius."""
 MOST = 100_000  # Largest number of grains in a cell: this many take minutes to arrange
 ROUNDEST, FLATTEST = 0.6, 0.85  # Least and largest cut of truncated octahedra; see `truncated_octahedron`
+MADE_OF: Mapping[str, str] = MappingProxyType(
+    {
+        "wall": "Al",
+        "electrolyte": "electrolyte",
+        "collector": "Al",
+        "separator": "separator",
+        "particle": "LiCoO2",
+        "pore": "electrolyte",
+        "crack": "electrolyte",
+    }
+)
+"""Material of each part by default."""
+GREY: Mapping[str, float] = MappingProxyType(
+    {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
+)
+"""Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
+transmits about 5 % at its thickest part."""
 
 
 @dataclass(frozen=True)
@@ -132,26 +149,6 @@ def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
 def inner_radius(grain: Grain) -> float:
     """mm, of the largest sphere around a grain's centre that lies inside it."""
     return min(grain.semi_axes) if isinstance(grain, Ellipsoid) else float(grain.hull().distances.min())
-
-
-MADE_OF: Mapping[str, str] = MappingProxyType(
-    {
-        "wall": "Al",
-        "electrolyte": "electrolyte",
-        "collector": "Al",
-        "separator": "separator",
-        "particle": "LiCoO2",
-        "pore": "electrolyte",
-        "crack": "electrolyte",
-    }
-)
-"""Material of each part by default."""
-
-GREY: Mapping[str, float] = MappingProxyType(
-    {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
-)
-"""Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
-transmits about 5 % at its thickest part."""
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,10 @@ from beamline.core.events import Sink
 from beamline.energies.spectra import read_spectra
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.job import progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.reconstruct.progress import progress_events
 from beamline.reconstruct.region import Region
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.clock import Clock, SystemClock
