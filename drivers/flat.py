@@ -41,11 +41,11 @@ class Key:
 
     @property
     def converted(self) -> bool:
-        """The field is in another unit than the key."""
+        """Whether the field has another unit than the key."""
         return self.unit in ANGULAR or self.unit == MEGABYTES
 
     def inside(self, value: Any) -> Any:
-        """A number of the key as the field has it."""
+        """A number from the configuration in the unit of the field."""
         if value is None or not self.converted:
             return value
         return math.radians(value) if self.unit in ANGULAR else value * 1_000_000
@@ -79,7 +79,7 @@ class FlatField:
 
     @property
     def optional(self) -> bool:
-        """Whether it may be None."""
+        """Whether the field may be None."""
         return self.plain is not self.type
 
 

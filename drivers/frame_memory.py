@@ -77,7 +77,7 @@ class FrameMemory:
         return why
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.uint16]:
-        """An array uint16 [row, col] of arbitrary content, in memory of its own."""
+        """An array uint16 [row, col] of arbitrary content, in memory that no other frame uses."""
         wanted = 2 * shape[0] * shape[1]
         if wanted != self._bytes:  # frames of another size return to the list that is dropped here
             self._free, self._bytes = deque(), wanted

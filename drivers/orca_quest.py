@@ -107,7 +107,7 @@ class TriggerPolarity(StrEnum):
 
 
 class GlobalExposure(StrEnum):
-    """When rows start to expose after a pulse.
+    """Time at which the rows start to expose after a pulse.
 
     DELAYED: one after the other (rolling shutter). GLOBAL_RESET: all at once; since they are read one after the other,
     later rows are exposed for longer unless the light is shut off.

@@ -17,7 +17,7 @@ INSIDE, OUTSIDE = "into the beam", "out of the beam"
 
 @dataclass(frozen=True)
 class StagePlaces:
-    """Where a stage goes, by name.
+    """Positions of a stage by name.
 
     Attributes:
         places: rad of the stage.
@@ -85,7 +85,7 @@ class PlacedStage:
         return moved
 
     def close(self) -> None:
-        """It stays where it is."""
+        """Close the connection; the stage stays where it is."""
         self._stage.close()
 
     def _is_at(self, place: str) -> bool:

@@ -17,7 +17,7 @@ from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
-from recon.splatting.initialise import leaves_the_field
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
@@ -69,7 +69,7 @@ def axis_by_views(
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
     warn_of_other_quantity(projections)
     views = _Views(projections if lit is None else np.where(lit, projections, 0).astype(np.float32), geometry, lit)
-    if not leaves_the_field(views.data, geometry):
+    if not wider_than_field(views.data, geometry):
         return _search(views, progress, 1.0, near)
     tried = 0
 

@@ -95,7 +95,7 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | R
         for at, view in enumerate(data)
         if not np.isfinite(view).all()
     )
-    if lost:
+    if 0 < lost < data.size:
         warnings.warn(
             f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
             "and weigh nothing. Give DataUse(weights) of 0 there, where that is known",

@@ -141,7 +141,7 @@ class Documents:
         self._config, self._emit, self._stream = config, emit, ScanStream(config, name)
         self._run: Any = None
         self._descriptor: Any = None
-        self._exit, self._reason = "success", ""
+        self._exit = "success"
 
     def __call__(self, event: Event) -> None:
         if event.source is not None:  # of the live reconstruction

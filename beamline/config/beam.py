@@ -1,4 +1,4 @@
-"""Configuration of the beam monitor: what every kind has."""
+"""Configuration of the beam monitor: the keys that all kinds share."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.base.protocols import BeamMonitor
 
 
 class BeamMonitorSection(Section):
-    """What every beam monitor has. The kinds are found in folders of `beamline.config`, by their BEAM_MONITORS."""
+    """Keys that all beam monitors share. The kinds are in folders of `beamline.config`, by their BEAM_MONITORS."""
 
     unit: str
     scale: PositiveFloat = 1.0
@@ -31,19 +31,19 @@ class BeamMonitorSection(Section):
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
         if self.pause_below is None and self.resume_above is not None:
-            raise ValueError("resume_above has no meaning without pause_below: set both, or neither")
+            raise ValueError("resume_above needs pause_below: set both, or neither")
         if self.pause_below is not None and self.resumes_at < self.pause_below:
             raise ValueError(f"resume_above {self.resumes_at:g} is below pause_below {self.pause_below:g}")
         return self
 
     @property
     def resumes_at(self) -> float:
-        """In `unit`."""
+        """Intensity in `unit` from which a paused scan resumes."""
         return self.resume_above or 1.1 * (self.pause_below or 0.0)
 
     @property
     def counterpart(self) -> str | None:
-        """Its simulated counterpart, which the port sim:// with this name is; None: it has none."""
+        """Name of its simulated counterpart, at the port sim:// with this name; None: it has none."""
         return None
 
     @property

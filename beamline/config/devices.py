@@ -171,7 +171,7 @@ class DeviceSection(Section):
                 f"use the output of another controller (stage.kind {' or '.join(with_outputs)})"
             )
         if shutter.output == taken:
-            raise ValueError(f"shutter.output {taken} is the output that the stage's trigger pulses come from")
+            raise ValueError(f"shutter.output {taken} carries the trigger pulses of the stage; choose another output")
         return self
 
     @model_validator(mode="after")
@@ -182,7 +182,7 @@ class DeviceSection(Section):
                 continue
             if (port := device.stage.port) in taken:
                 raise ValueError(
-                    f"{name}.stage.port {port} is that of {taken[port]}, and a port is opened once; the "
+                    f"{name}.stage.port {port} is used by {taken[port]}, too, and a port can be opened once; the "
                     f"{name.replace('_', ' ')} needs a controller, or a record, of its own"
                 )
             taken[port] = f"devices.{name}"

@@ -143,7 +143,7 @@ def override_of(key: str, value: object) -> str:
         text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True)
     except yaml.YAMLError:
         raise ConfigError(
-            f"{key}: {value!r} is no value of a configuration; expected a number, a text, a list or a group. Nothing "
+            f"{key}: a configuration cannot hold {value!r}; expected a number, a text, a list or a group. Nothing "
             "was started."
         ) from None
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
@@ -270,7 +270,7 @@ def _group(data: Any, *path: str) -> dict[str, Any] | None:
 
 
 def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Key path and sentence of each fault; `shipped`: folder of the configurations that come with the package."""
+    """Key path and message of each fault. shipped: folder of the configurations that come with the package."""
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)

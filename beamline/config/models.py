@@ -177,7 +177,7 @@ class ReconSection(Section):
         if self.stop_when is not None and not self.live:
             raise ValueError("stop_when needs live: true, because the live reconstruction tells when views are enough")
         if self.stop_when is not None and (self.method == AUTO or not streams(self.method)):
-            raise ValueError(f"stop_when needs a volume that grows while the scan runs; {self.method} has none, r2 has")
+            raise ValueError(f"stop_when needs a method whose volume grows while views come, as r2; got {self.method}")
         return self
 
 
@@ -217,7 +217,7 @@ class Config(Section):
             few_simulated = 2 * sum(simulated.values()) <= len(simulated)
             odd = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
-                f"devices.{odd}: simulated devices cannot see real ones: {unreal} simulated, {real} real; make all "
+                f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} real. Make all "
                 "simulated or none. `beamline scan CONFIG --rehearse` takes a real configuration with simulated devices"
             )
         if any(simulated.values()) and self.simulation is None:
@@ -233,7 +233,7 @@ class Config(Section):
         named, there = self.scan.filter, list(self.devices.filter.places)
         if named is not None and named not in there:
             legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has none"
-            raise ValueError(f"scan.filter {named!r} is no place of the filter; {legal}")
+            raise ValueError(f"scan.filter {named!r} is not one of the filter's places; {legal}")
         return self
 
     @model_validator(mode="after")
@@ -265,7 +265,7 @@ class Config(Section):
             )
         texts = [f"{energy:.7g}" for energy in energies]  # as the names of run folders
         if twice := [text for text in texts if texts.count(text) > 1]:
-            raise ValueError(f"scan.energies has an energy twice, to seven digits: {twice[0]} keV; give each once")
+            raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
         if several and self.recon.stop_when is not None:
             raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)

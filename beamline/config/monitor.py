@@ -1,4 +1,4 @@
-"""Sections `monitor` and `references` of the configuration: effects of alarms and faults, and limits.
+"""Sections `monitor` and `references` of the configuration: limits, and what alarms and faults do to a scan.
 
 The keys of limits are the fields of the checks in the registry, and of `ReferenceLimits`. A check that enters the
 registry can be configured without an edit here.
@@ -39,7 +39,7 @@ class MonitorBase(Section):
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
-        """The checks whose warnings have views taken again."""
+        """The checks whose warnings make the scan take a view again."""
         return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 
@@ -74,7 +74,7 @@ def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
 
 
 def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
-    """What alarms of each check do to a scan, by the check's name."""
+    """Policy for the alarms of each check, by the check's name."""
     section: Section = monitor.policy  # type: ignore[attr-defined]  # made above, from the registry
     return {name: Policy(policy) for name, policy in section}
 

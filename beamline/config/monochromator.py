@@ -26,7 +26,7 @@ class _Monochromator(Section):
     def _range_rises(self) -> Self:
         if self.range_kev is not None and self.range_kev[0] > self.range_kev[1]:
             low, high = self.range_kev
-            raise ValueError(f"range_kev is {low:g} ... {high:g}; expected the lower energy first")
+            raise ValueError(f"range_kev is {low:g} ... {high:g}; give the lower energy first")
         return self
 
 

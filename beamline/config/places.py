@@ -1,4 +1,4 @@
-"""Configuration of what stands at named places: the sample mover by a motor, and the filter."""
+"""Configuration of devices with named places: a sample mover on a motor, and the filter."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class NamedFilter(Section):
     @model_validator(mode="after")
     def _each_once(self) -> Self:
         if twice := [name for name in dict.fromkeys(self.places) if self.places.count(name) > 1]:
-            raise ValueError(f"places has {', '.join(twice)} more than once; a place has one name")
+            raise ValueError(f"places lists {', '.join(twice)} more than once; each place needs its own name")
         return self
 
 
@@ -120,6 +120,6 @@ class FoundFilter(Section):
 
 
 def refuse_equal(places: Mapping[str, float | str]) -> None:
-    """Raises ValueError: two places have one value."""
+    """Raise ValueError if two places have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("places: two have one value, so that nobody could tell them apart")
+        raise ValueError("two places have the same value and cannot be told apart; give each its own")

@@ -14,7 +14,7 @@ from drivers.flat import FlatField, Key, flat_fields, from_flat
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Refuses a text that has a problem."""
+    """A validator that refuses a text for which `problem_of` returns a problem."""
 
     def checked(text: str) -> str:
         if problem := problem_of(text):
@@ -44,7 +44,7 @@ class Section(BaseModel):
 
 
 def declared(settings: type[Any]) -> dict[str, Any]:
-    """Type and default of each key, by name, as `section_of` takes them."""
+    """Type and default of each key by name, for `section_of`."""
     return {_name(field): _declared(field) for field in flat_fields(settings)}
 
 

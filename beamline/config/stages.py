@@ -27,13 +27,13 @@ _IDENTITY = ("model", "serial", "device", "axis", "channel")
 
 
 def keep_found_settings(stage: RotationStage, folder: Path | None = None) -> None:
-    """Keep them on disk from now on; what an earlier program left there is restored in their place."""
+    """Keep the found settings on disk; those that an earlier program left there are restored instead."""
     if isinstance(stage, RestoresSettings):
         stage.keep_found_settings(FoundOnDisk(file_of(stage.describe(), folder or state_folder() / "stages")))
 
 
 def file_of(said: Mapping[str, object], folder: Path) -> Path:
-    """The file of a stage that describes itself so: by its serial number, or its port if it tells none."""
+    """File for the stage with this description: named by its serial number, or by its port if it reports none."""
     which = [str(said[key]) for key in _IDENTITY if key in said] + ([] if "serial" in said else [str(said.get("port"))])
     name = re.sub(r"\W+", "-", " ".join(which)).strip("-")[:60]
     return folder / f"{name}-{crc32(json.dumps(which).encode()):08x}.json"
@@ -63,7 +63,7 @@ class FoundOnDisk:
 
 
 class StageSection(Section):
-    """What every stage has. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
+    """Keys that all stages share. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
 
     kind: str
     port: Annotated[str, Field(min_length=1)]

@@ -69,7 +69,7 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
         what = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{name}: this is not YAML ({what}). Nothing was started.") from None
     except RecursionError:
-        raise ConfigError(f"{name}: a value holds itself, or is nested beyond reason. Nothing was started.") from None
+        raise ConfigError(f"{name}: a value contains itself or is nested too deeply. Nothing was started.") from None
     finally:
         if loader is not None:
             loader.dispose()

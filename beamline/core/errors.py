@@ -99,7 +99,7 @@ def exit_code(error: BaseException) -> int:
 
 
 def memory_limit_sentence() -> str:
-    """A sentence, after a space, on the addresses that this process may take; "" without a limit."""
+    """A sentence, after a space, on the limit of this process's address space; "" without one."""
     from beamline.core.machine import memory_limit  # here, because most messages need none of it
 
     limit = memory_limit()
@@ -117,7 +117,7 @@ numpy."""
 
 
 def out_of_memory(error: BaseException | None) -> bool:
-    """Whether memory, or the addresses that a process may take, ran out: each library has its own words for that.
+    """Whether memory or address space ran out; each library reports that in its own words.
 
     An error that was raised on the way from such a one counts, too, unless it says itself what happened.
     """

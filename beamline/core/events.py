@@ -54,7 +54,7 @@ class Event:
 
     @property
     def data(self) -> dict[str, Any]:
-        """Its values by name, as a JSON line has them."""
+        """The values of the event by name, as in its JSON line."""
         values: dict[str, Any] = {}
         own_fields = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
         for each in (*own_fields, *(each for each in fields(Event) if each.name != "time")):
@@ -206,7 +206,7 @@ class RunStarted(Event, event="run_started"):
 
 
 class StateEntered(Event, event="state"):
-    """A scan enters a state, or has something to say in it; of a reconstruction, `state` is a topic.
+    """A scan enters a state, or reports something in it; in a reconstruction `state` is a topic.
 
     Attributes:
         message: for people; may be empty.
@@ -244,7 +244,7 @@ class BlockDone(Event, event="block_done"):
 
 
 class FrameStored(Event, event="frame"):
-    """A frame is in the file; ten times a second at most. mean: of its counts; simulations do not say it."""
+    """A frame is in the file; at most ten events a second. mean: of its counts; simulations leave it out."""
 
     n: int
     of: int
@@ -303,7 +303,7 @@ class SnapshotWritten(Event, event="snapshot"):
 
 
 class SlicesDrawn(Event, event="slices"):
-    """Slices by FBP of the views so far are in the picture. degrees: of the half turn, that the views cover."""
+    """A picture has FBP slices of the views so far. degrees: angle of the half turn that the views cover."""
 
     picture: Path
     n_views: int
@@ -362,7 +362,7 @@ class KernelsCompiled(Event, event="progress"):
 
 
 class FitReached(Event, event="progress"):
-    """Where a fit or iterations stand; the fields are those of `recon.base.method.Progress`, a rate and a time left.
+    """Progress of a fit or of iterations: the fields of `recon.base.method.Progress`, a rate and the time left.
 
     waiting: views of a growing scan that are in the file, and that no step has learnt yet.
 
@@ -391,7 +391,7 @@ class ScanDone(Event, event="scan_done"):
 
 
 class ReconStarted(Event, event="recon_started"):
-    """Line integrals are ready, and the method begins. again: a live one, anew, as its axis has moved.
+    """Line integrals are ready, and the method begins. again: a live fit starts anew because its axis has moved.
 
     more: of a finished scan, values by name; `axis_confident` is None where the axis was given.
     """
@@ -454,18 +454,18 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended well. result: a `RunResult`; of a line of another process, its values by name."""
+    """A run has ended well. result: a `RunResult`; read from the line of another process, its values by name."""
 
     folder: Path
     result: Any = _spread(RunResult.run_values)
 
 
 class Done(Listed, event="done"):
-    """A command has ended well; the values are what it found or wrote."""
+    """A command has ended well. values: what it found or wrote."""
 
 
 class VolumeDone(Event, event="done"):
-    """A reconstruction of this process has ended well; that of another process is read as `Done`.
+    """A reconstruction of this process has ended well; the event of another process is read as `Done`.
 
     record: of the volume, a `beamline.storage.recon_record.ReconRecord`.
     """
@@ -474,7 +474,7 @@ class VolumeDone(Event, event="done"):
 
 
 class Failed(Event, event="failed"):
-    """A command has ended otherwise. folder: of the run."""
+    """A command has failed. folder: of the run."""
 
     message: str
     exit_code: int | None = None

@@ -1,4 +1,4 @@
-"""Files: read only where regular, written whole or not at all, never over another one unless asked; parts' folders."""
+"""Files: only regular ones are read; a file is written whole or not at all, and replaces none unless asked."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run_of(folder: Path) -> Path:
 
 
 def create_part(run: Path) -> Path:
-    """The folder of a new part, after the others."""
+    """Make the folder of a new part, after the others."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)
     folder.mkdir(mode=OURS)
     return folder
@@ -124,7 +124,7 @@ def require_below(folder: Path, name: str, largest: float = math.inf) -> Path:
 
 
 def is_below(folder: Path, name: str) -> bool:
-    """There is such a file, as `require_below` says: no link, no pipe, and not another user's."""
+    """Whether `require_below` accepts the file: no link, no pipe, and not another user's."""
     try:
         return require_below(folder, name).is_file()
     except OSError:
@@ -184,7 +184,7 @@ def decoded(content: bytes) -> str:
 
 
 def broken_link(path: Path) -> str:
-    """A sentence if `path`, or a folder on the way to it, is a link to what is not there; "" if not."""
+    """A sentence if `path`, or a folder on the way to it, is a link whose target does not exist; "" if not."""
     for place in (path, *path.parents):
         if place.is_symlink() and not place.exists():
             return f"{place} is a link to {place.readlink()}, which is not there: is its disk mounted?"
@@ -228,7 +228,7 @@ def replaceable(path: Path) -> Path:
 
 
 def to_disk(handle: int) -> None:
-    """Wait until all data written to an open file are on the disk. OSError if the disk did not take them."""
+    """Wait until all data written to an open file are on the disk. OSError if writing failed."""
     try:
         os.fsync(handle)
     except OSError as error:
@@ -236,18 +236,8 @@ def to_disk(handle: int) -> None:
             raise
 
 
-def folder_to_disk(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk; Windows has no such call. OSError if it did not take them."""
-    if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            to_disk(handle)
-        finally:
-            os.close(handle)
-
-
 def bring_to_disk(path: Path) -> None:
-    """Wait until a file, or every file in a folder, is on the disk. OSError if the disk did not take it."""
+    """Wait until a file, or every file in a folder, is on the disk. OSError if writing failed."""
     for part in path.rglob("*") if path.is_dir() else (path,):
         if part.is_file():
             with part.open("r+b") as file:  # Windows needs a file opened for writing

@@ -1,4 +1,4 @@
-"""Flag: what a check of the monitor says of a frame; the event `flag` carries it."""
+"""Flag: the finding of a monitor check about a frame; the event `flag` carries it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Flag:
-    """A check's finding.
+    """The finding of a check about one frame or several.
 
     Attributes:
         check: name of the check.
@@ -49,11 +49,11 @@ class Flag:
 
     @property
     def frames(self) -> range:
-        """Frames of the file that it holds for."""
+        """Frames of the file that it applies to."""
         return range(self.frame if self.first is None else self.first, self.frame + 1)
 
     def regions(self) -> dict[int, PixelBox]:
-        """Where it is in each of its frames in which that is known."""
+        """Regions of its frames that show it, where they are known."""
         if self.region is None:
             return {}
         if self.from_region is None:
@@ -62,5 +62,5 @@ class Flag:
         return {frame: tuple(box) for frame, box in zip(self.frames, boxes, strict=True)}
 
     def event_values(self) -> dict[str, Any]:
-        """What the event `flag` says, by name."""
+        """Values of the event `flag` by name."""
         return {name: value for name, value in vars(self).items() if name != "from_region" or value is not None}

@@ -42,7 +42,7 @@ def machine() -> dict[str, str | int]:
 
 
 def machine_line(found: dict[str, str | int] | None = None) -> str:
-    """`machine()` as one line of text: a time means nothing without it."""
+    """`machine()` as one line of text, to stand beside measured times."""
     m = found or machine()
     return (
         f"{m['processor']}, {count(int(m['cores']), 'core')}, {count(int(m['threads']), 'thread')}, {m['system']}, "
@@ -58,7 +58,7 @@ def usable_cores() -> int:
 
 
 def free_memory() -> int:
-    """Bytes that can be had without swapping, also within a container's limit and that of `memory_limit`."""
+    """Free memory in bytes, without swapping, within the limits of the container and of `memory_limit`."""
     free = [int(psutil.virtual_memory().available), *_left_in_cgroups(CGROUPS, OWN_CGROUP)]
     if (limit := memory_limit()) is not None:
         free.append(max(limit - int(psutil.Process().memory_info().vms), 0))
@@ -66,7 +66,7 @@ def free_memory() -> int:
 
 
 def memory_limit() -> int | None:
-    """Bytes of addresses that this process may take (ulimit -v); None without a limit, and on Windows."""
+    """Limit of this process's address space in bytes (ulimit -v); None without a limit, and on Windows."""
     if sys.platform != "win32":
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         return None if limit == resource.RLIM_INFINITY else limit
@@ -74,7 +74,7 @@ def memory_limit() -> int | None:
 
 
 def peak_memory() -> int | None:
-    """Largest resident set of this process so far, in bytes; None if the system does not tell."""
+    """Largest resident set of this process so far, in bytes; None if the system does not report it."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     if STATUS.is_file():
@@ -90,7 +90,7 @@ def reset_peak_memory() -> None:
 
 
 def state_folder() -> Path:
-    """Where this user's programs keep what outlives them."""
+    """Folder in which this user's programs keep data between runs."""
     if sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     else:
@@ -99,7 +99,7 @@ def state_folder() -> Path:
 
 
 def processor() -> str:
-    """The name of its processor."""
+    """Name of this machine's processor."""
     if _CPUINFO.is_file():
         for line in _CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines():
             name, _, value = line.partition(":")

@@ -25,7 +25,7 @@ _LAWS = 1  # to be raised where an operation in `recon.machine_speed` takes anot
 
 @dataclass
 class MachineSpeed:
-    """The rates of operations on this machine, as `recon.base.work.Rates`; those not kept yet are measured.
+    """Rates of operations on this machine, as `recon.base.work.Rates`; a missing one is measured and kept.
 
     Figures of another processor, number of cores or threads, or version are not taken, nor those of more than 30 days
     ago. A disk that does not take them loses only time: the next program measures again.
@@ -89,7 +89,7 @@ def _this_machine() -> dict[str, Any]:
 
 
 def seconds_left(done: float, total: float, spent: float) -> float | None:
-    """s that the rest takes, if it goes on as so far; None: nothing is done yet.
+    """Seconds left at the speed so far; None while nothing is done.
 
     Args:
         done, total: in any unit in which the work is even, such as s of a prediction.

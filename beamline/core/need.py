@@ -1,4 +1,4 @@
-"""Need: what a work will take, as each dry run states it."""
+"""Need: time, memory and disk space of a piece of work, as each dry run states them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Need:
-    """What a work will take, at most.
+    """Upper bounds of what a piece of work takes.
 
     Attributes:
         memory: bytes; None: not known.
@@ -26,12 +26,12 @@ class Need:
 
     @property
     def disk(self) -> int:
-        """Bytes on the disk of the output, while it works."""
+        """Peak bytes on the disk of the output while the work runs."""
         return self.output + self.scratch
 
     @staticmethod
     def in_turn(needs: Iterable[Need]) -> Need:
-        """Of works one after the other: the most memory and scratch space, and all seconds that are known."""
+        """The need of several works in turn: the largest memory and scratch space, and the sum of known seconds."""
         each = list(needs)
         return Need(
             memory=max((need.memory or 0 for need in each), default=0),

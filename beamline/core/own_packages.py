@@ -1,4 +1,4 @@
-"""Our packages beside `beamline` have common names: whether Python finds ours, and who else brings such a package.
+"""Clashes of names: whether Python finds our packages, and which other distributions bring one of the same name.
 
 This runs before all else is imported, and imports the standard library alone.
 """
@@ -13,7 +13,7 @@ _MARK = b"splatline"  # in the first line of each one's __init__.py
 
 
 def package_problem(home: str) -> str:
-    """What is wrong, with what to do, where Python finds another module by the name of one of our packages; "" if not.
+    """A sentence with advice if Python finds another module by the name of one of our packages; "" if not.
 
     Args:
         home: the folder that holds our packages.

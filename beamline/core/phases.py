@@ -12,7 +12,7 @@ _SAY_EVERY = 0.2  # s between events on the progress of a phase
 
 
 class Phases:
-    """One phase follows the other without a gap, so that their seconds add up to the time since the start.
+    """Phases without gaps, so that their seconds add up to the time since the start.
 
     Args:
         sink: gets an event `progress` of the stage "phase" as each begins, and some on its progress.
@@ -34,7 +34,7 @@ class Phases:
         self._say(0, 0, None, None)
 
     def progress(self, n: int, total: int) -> None:
-        """So much of the phase is done; of nothing nothing is said."""
+        """Report that n of `total` are done; n = 0 is not reported."""
         now = self._clock.now()
         if not n:
             return

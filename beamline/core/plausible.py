@@ -26,14 +26,14 @@ class PlausibleRange:
 
 RANGES: Mapping[str, PlausibleRange] = MappingProxyType(
     {
-        "pixel_size_um": PlausibleRange(0.05, 500.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
+        "pixel_size_um": PlausibleRange(0.05, 5000.0, "um", {"mm": 1e3, "nm": 1e-3, "m": 1e6}),
         "energy_kev": PlausibleRange(0.1, 600.0, "keV", {"eV": 1e-3, "MeV": 1e3}),
         "distance_mm": PlausibleRange(0.0, 2e4, "mm", {"um": 1e-3, "nm": 1e-6}),
         "exposure_s": PlausibleRange(1e-6, 600.0, "s", {"ms": 1e-3, "us": 1e-6}),
     }
 )
-"""By name: from pixels behind X-ray lenses to those of flat panels, from carbon's edge to tubes of 600 kV, the longest
-hutches, and the longest exposures that a ring lasts."""
+"""By name: from pixels behind X-ray lenses to those of a scanner of patients, from carbon's edge to tubes of 600 kV,
+the longest hutches, and the longest exposures that a ring lasts."""
 
 
 def doubt(name: str, value: float | None) -> str:

@@ -103,7 +103,7 @@ class ChildProcess:
 
     @property
     def code(self) -> int | None:
-        """The exit code; None while it runs."""
+        """Exit code of the process; None while it runs."""
         return self._process.poll()
 
     def wait(
@@ -157,7 +157,7 @@ class ChildProcess:
             os.write(self._process.stdin.fileno(), b".")
 
     def end(self, grace: float = 0.0) -> None:
-        """End the process if it still runs: it has `grace` real s before it is killed."""
+        """Ask the process to end; kill it if it still runs after `grace` real s."""
         if self.running:
             self._end(grace, lambda: False)
             self._reader.join(_LAST_LINES)
@@ -187,7 +187,7 @@ class ChildProcess:
         return self._silent_since, 0.0
 
     def let_go(self) -> None:
-        """Close the stdin of a tethered process, as our end would."""
+        """Close the stdin of a tethered process, which sees the same when our process ends."""
         if self._process.stdin is not None:
             with suppress(OSError):  # a line that the process did not take
                 self._process.stdin.close()

@@ -1,4 +1,4 @@
-"""The result of a scan: what its caller gets, and what the events `scan_done` and `done` say."""
+"""The result of a scan, for its caller and for the events `scan_done` and `done`."""
 
 from __future__ import annotations
 
@@ -46,34 +46,34 @@ class RunResult:
 
     @property
     def folder(self) -> Path:
-        """Of the run."""
+        """Folder of the run."""
         return self.path.parent
 
     @property
     def frames(self) -> int:
-        """`n_frames`, as scripts call it."""
+        """Number of frames; the name of `n_frames` in scripts."""
         return self.n_frames
 
     @property
     def alarms(self) -> int:
-        """`alarmed_frames`, as scripts call it."""
+        """Frames with an alarm; the name of `alarmed_frames` in scripts."""
         return self.alarmed_frames
 
     @property
     def volume(self) -> Path | None:
-        """File of the reconstruction; None without one, or if it failed."""
+        """File of the reconstruction; None if there was none or it failed."""
         return None if self.recon is None else Path(str(self.recon["output"]))
 
     @property
     def clean(self) -> bool:
-        """Whether the scan is complete, without a fault of frames, darks or flats."""
+        """Whether the scan is complete and no frame, dark or flat has a fault."""
         return self.status == "complete" and not (self.missing or self.alarmed_frames or self.reference_faults)
 
     def file_values(self) -> dict[str, Any]:
-        """What the event `scan_done` says when the file is closed, by name."""
+        """Values of the event `scan_done`, by name, when the file is closed."""
         without = ("sample",) if self.returned else ("sample", "returned")
         return {name: value for name, value in vars(self).items() if name not in without}
 
     def run_values(self) -> dict[str, Any]:
-        """What the event `done` says of a run that has ended well, by name."""
+        """Values of the event `done`, by name, of a run that has ended well."""
         return {name: value for name, value in vars(self).items() if name not in ("sample", "status")}

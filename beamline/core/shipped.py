@@ -1,4 +1,4 @@
-"""What is installed: the version, and configurations and scenes that come with the package."""
+"""The installed version, and the configurations and scenes that come with the package."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def fan_out(*sinks: Sink) -> Sink:
 
 
 def while_it_works(sink: Sink, others: Sink) -> Sink:
-    """A sink that gets events until it raises (a full disk, a closed pipe); `others` then gets a warning, once."""
+    """Pass events to a sink until it raises (a full disk, a closed pipe); then warn `others` once."""
     works = True
 
     def send(event: Event) -> None:

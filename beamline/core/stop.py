@@ -127,7 +127,7 @@ once a stop was requested."""
 
 @contextmanager
 def never_stopped() -> Iterator[Callable[[], bool]]:
-    """The stop scope of work that nothing ends early."""
+    """The stop scope of work that cannot be stopped early."""
     yield lambda: False
 
 
@@ -138,7 +138,7 @@ class ScanAborted(ScanStopped):
 
 
 class Cause(Enum):
-    """A cause that pauses a scan until it is over."""
+    """Cause of a pause, which lasts until the cause is over."""
 
     BEAM = "beam"
     SPACE = "space on the disk"
@@ -229,7 +229,7 @@ class StopRequest:
         self.stopping = True
 
     def stop_as_enough(self, reason: str) -> None:
-        """As `stop`, but without hurry: the frames so far serve their purpose."""
+        """As `stop`, but without hurry, because the views are enough."""
         self._enough = not self.stopping
         self.stop(reason, by_itself=True)
 
@@ -242,7 +242,7 @@ class StopRequest:
 
     @property
     def enough(self) -> bool:
-        """Whether it is stopped only by `stop_as_enough`."""
+        """Whether only `stop_as_enough` asked for the stop."""
         return self._enough and not self.aborting
 
     @property

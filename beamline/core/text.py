@@ -33,7 +33,7 @@ def printable(text: str) -> str:
 
 
 def one_line(text: str, most: int = 200) -> str:
-    """The text of somebody else as one line of a log or a terminal, without control characters and not too long."""
+    """A foreign text as one line for a log or a terminal: shortened, without control characters."""
     line = printable(" ".join(text[: 4 * most].split()))
     return line if len(line) <= most else line[: most - 3] + "..."
 

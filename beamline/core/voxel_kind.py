@@ -1,4 +1,4 @@
-"""What the voxels of a volume are, with the unit that this gives them."""
+"""Quantity of a volume's voxels, and its unit."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class VoxelKind(Enum):
-    """What a voxel says of the sample."""
+    """Quantity that the voxels hold."""
 
     ATTENUATION = "attenuation"
     """Linear attenuation coefficient, of views in transmission."""
@@ -16,11 +16,11 @@ class VoxelKind(Enum):
     """Share of the voxel that a material fills, without a unit."""
 
     def unit(self, length: str) -> str:
-        """Of a voxel, where lengths are in `length`, "mm" or "px"; empty for shares."""
+        """Unit of a voxel, with lengths in `length`, "mm" or "px"; empty for shares."""
         return {self.ATTENUATION: f"1/{length}", self.ACTIVITY: f"counts/{length}", self.SHARE: ""}[self]
 
     def label(self, length: str) -> str:
-        """Of an axis or a colour bar: what is shown, and its unit."""
+        """Label of an axis or a colour bar: the quantity and its unit."""
         unit = self.unit(length)
         return f"{self.value} ({unit})" if unit else self.value
 

@@ -16,6 +16,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT, CellGrid
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
+from recon.voxels.field_edges import LEAST
 
 LASTS = 5  # views in a row with matter at an edge
 NO_BEAM = 3.0  # times the noise: a flat's bright part below this has no light; noise alone gives 1.3
@@ -46,7 +47,9 @@ class FieldOfViewCheck:
     policy: ClassVar[Policy] = Policy.LOG
 
     unlit: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
-    edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = 0.1
+    edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = (
+        LEAST
+    )
 
     start = FieldState
 

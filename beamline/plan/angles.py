@@ -106,7 +106,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
             raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("there is no angle in it; expected one angle in degrees a line")
+        raise ValueError("it holds no angle; expected one angle in degrees a line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 
@@ -119,7 +119,7 @@ class Retake:
 
 
 def spread(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
-    """At most so many of the views, evenly spread, so that the others leave small gaps instead of a large one."""
+    """At most so many of the views, evenly spread: gaps between them stay small."""
     if len(views) <= most:
         return tuple(views)
     return tuple(views[i] for i in np.unique(np.linspace(0, len(views) - 1, most).round().astype(int)))
@@ -140,7 +140,7 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
 
 
 def return_triggers(views: Block, n: int) -> NDArray[np.int64]:
-    """So many of the views, evenly spread in angle, in the order in which a stage meets them on its way back."""
+    """Triggers of `n` views, evenly spread in angle, in the order in which a stage passes them on its way back."""
     ahead = np.argsort(views.angles, kind="stable")
     chosen = ahead[np.unique(np.linspace(0, views.n - 1, min(n, views.n)).round().astype(int))]
     back = abs(views.angles[chosen[0]] - views.angles[-1]) > abs(views.angles[chosen[-1]] - views.angles[-1])
@@ -148,7 +148,7 @@ def return_triggers(views: Block, n: int) -> NDArray[np.int64]:
 
 
 def return_block(views: Block, n: int, *, stored: bool) -> Block:
-    """The block that takes so many views a second time on the way back; the stage stands during each exposure."""
+    """The block that repeats some views on the way back; the stage stands during each exposure."""
     block = retake_block(views, return_triggers(views, n))
     return replace(block, kind=FrameKind.ALIGNMENT, stored=frozenset(range(block.n)) if stored else frozenset[int]())
 

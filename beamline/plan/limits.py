@@ -66,7 +66,7 @@ def violations(facts: PlanFacts) -> Iterator[str]:
 
 
 def remarks(facts: PlanFacts) -> Iterator[str]:
-    """One sentence for each thing worth knowing."""
+    """One sentence for each remark."""
     plan, camera = facts.plan, facts.camera
     yield from _rounding(facts)
     period = facts.views.period

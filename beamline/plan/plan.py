@@ -120,13 +120,13 @@ class Block:
 
     @property
     def left(self) -> int:
-        """Frames to take."""
+        """Number of frames to take."""
         return self.n - len(self.stored)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """A plan worked out for one stage and one camera. `violations` is empty exactly when the scan may start.
+    """A plan computed for one stage and one camera. The scan may start exactly if `violations` is empty.
 
     Attributes:
         blocks: in the order of acquisition.
@@ -169,5 +169,5 @@ class Timeline:
 
     @property
     def views(self) -> Block:
-        """The block of projections: every timeline has one."""
+        """The block of projections, which every timeline has."""
         return next(block for block in self.blocks if block.kind is FrameKind.PROJECTION)

@@ -1,4 +1,4 @@
-"""Timeline: a plan worked out for one stage and one camera, as values and as lines for the operator."""
+"""Timeline: a plan computed for one stage and one camera, as values and as lines for the operator."""
 
 from __future__ import annotations
 

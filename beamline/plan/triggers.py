@@ -21,7 +21,7 @@ class Scale:
 
     @classmethod
     def of(cls, to_counts: Callable[[float], int]) -> Scale:
-        """From the stage's own conversion, which has its direction and its zero."""
+        """The scale of a stage, from its own conversion, with its direction and its zero."""
         zero = to_counts(0.0)
         per_count = 2 * math.pi / (to_counts(2 * math.pi) - zero)
         return cls(-zero * per_count, per_count)

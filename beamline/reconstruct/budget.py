@@ -20,10 +20,11 @@ from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, Run
 from recon.base.volume import Grid
 from recon.base.work import Rates
 from recon.methods import with_settings
-from recon.splatting.initialise import default_count, leaves_the_field
+from recon.splatting.initialise import default_count
 from recon.splatting.work import speeds_of
 from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
+from recon.voxels.field_edges import wider_than_field
 
 _RESERVE = 0.02  # share of the budget for unmeasured work
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
@@ -155,7 +156,7 @@ def _is_wider(prepared: PreparedProjections) -> bool:
     problem = _problem_of(prepared, 0)
     weights = problem.use.weights
     views = masked(problem.projections[some], None if weights is None else weights[some])[0]
-    return leaves_the_field(views, problem.geometry.select(np.arange(prepared.geometry.n_views)[some]))
+    return wider_than_field(views, problem.geometry.select(np.arange(prepared.geometry.n_views)[some]))
 
 
 def _chosen(

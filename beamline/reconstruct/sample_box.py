@@ -55,7 +55,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     grid = Grid.matching(geometry_of(source, selection, prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
-    if cut := cut_sides(data, geometry) or cut_sides(data[:, _dense(data)], geometry):
+    if cut := cut_sides(data, geometry):
         where = " and the ".join(cut)
         return _whole(height, across, f"the sample goes on beyond the field at the {where}, where it shows no edge")
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
@@ -84,12 +84,6 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
 def _whole(height: int, across: int, why: str) -> Region:
     reason = f"--roi auto makes the whole volume: {why}."
     return Region((0, height), (0, across), (0, across), requested=False, reason=reason)
-
-
-def _dense(data: F32) -> NDArray[np.intp]:
-    """Rows whose deepest line integrals are half of those of the deepest row, or more."""
-    deepest = np.percentile(data, _DEEPEST, axis=(0, 2))
-    return np.flatnonzero(deepest >= 0.5 * deepest.max())
 
 
 def _least(data: F32) -> float:

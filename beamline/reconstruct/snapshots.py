@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -21,7 +22,7 @@ from beamline.plan.angles import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.figures import GreyWindow, bright_centre, grey_window, new_figure, png, round_length
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, round_length
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import write_reconstruction
@@ -38,8 +39,9 @@ from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
 
 if TYPE_CHECKING:
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
+    from PIL.Image import Image
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
 
 
 class Snapshots:
@@ -133,9 +135,11 @@ def _why(errors: Mapping[str, float]) -> str:
     return f"which predicts views held out better (error of the volume along them: {each})"
 
 
-_DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text
+_GAP, _LINE = 14, 15  # pixels: between panels, a line of text
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
 _SIGMAS = 5.0  # range of the differences
+_COLOURS = ((31, 119, 180), (255, 255, 255), (214, 39, 40))  # of the least difference, none, the largest
+_ORANGE = (255, 127, 14)
 _DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
 Wedge = tuple[float, float]
 """First and last angle, in radians modulo π, of the views that are still missing; without a wedge None."""
@@ -151,20 +155,32 @@ class PictureRow:
 
 def live_picture(rows: Sequence[PictureRow]) -> bytes:
     """The rows as PNG. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
+    from PIL import Image, ImageDraw
+
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
     headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
-    width, height = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
-    figure = new_figure((width / _DPI, height / _DPI), _DPI, False)
-    top = height
+    size = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
+    picture, top, file = Image.new("RGB", size, "white"), 0, io.BytesIO()
     for row, pixels in zip(rows, tall, strict=True):
         if row.heading:
-            top -= 2 * _LINE
-            figure.text(_GAP / width, (top + 0.4 * _LINE) / height, row.heading, fontsize=9, weight="bold")
+            ImageDraw.Draw(picture).text((_GAP, top + _LINE), row.heading, "black", _font(13, bold=True))
+            top += 2 * _LINE
         for k, panel in enumerate(row.panels):
-            panel.draw(figure, _GAP + k * across, top - _GAP)
-        top -= _GAP + 2 * _LINE + pixels
-    return png(figure, compression=1)
+            panel.draw(picture, _GAP + k * across, top + _GAP)
+        top += _GAP + 2 * _LINE + pixels
+    picture.save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+@cache
+def _font(size: int, bold: bool = False) -> FreeTypeFont:
+    """A font with arrows, of so many pixels."""
+    import matplotlib
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", name), size)
 
 
 def volume_rows(
@@ -203,7 +219,7 @@ def _slice_panels(
     pixels, zoom = _sized(images)
     bar = pixel / zoom, unit
     return [
-        _Panel(image, "gray", window, label, note, None if k else bar, None if k else unseen)
+        _Panel(image, window, label, note, None if k else bar, unseen=None if k else unseen)
         for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
     ]
 
@@ -216,17 +232,10 @@ def _view_panels(view: F32, render: F32) -> list[_Panel]:
     spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
     (view, render, difference), _ = _sized((view, render, difference))
     return [
-        _Panel(view, "gray", window, "newest view, u → z ↓", greys),
-        _Panel(render, "gray", window, "the fit seen from there", "the same greys"),
-        _Panel(difference, _differences(), (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
+        _Panel(view, window, "newest view, u → z ↓", greys),
+        _Panel(render, window, "the fit seen from there", "the same greys"),
+        _Panel(difference, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread, signed=True),
     ]
-
-
-@cache
-def _differences() -> LinearSegmentedColormap:
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("differences", ["tab:blue", "white", "tab:red"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,58 +244,49 @@ class _Panel:
 
     Attributes:
         pixels: of the screen [row, col].
-        colours, limits: colour map, and the values at its ends.
+        limits: values that are black and white; of differences (`signed`) blue and red.
         label, note: the two lines.
         bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
         unseen: for a dial of the rays in a slice across z that no view has taken yet; None: no dial.
     """
 
     pixels: F32
-    colours: str | LinearSegmentedColormap
     limits: GreyWindow
     label: str
     note: str
     bar: tuple[float, str] | None = None
+    signed: bool = False
     unseen: Wedge | None = None
 
-    def draw(self, figure: Figure, left: int, top: int) -> None:
-        """Draw it so many pixels from the left and the bottom of the figure, which is where its text begins."""
-        width, height = figure.get_size_inches() * _DPI
-        for line, (text, colour) in enumerate(((self.label, "black"), (self.note, "0.35")), 1):
-            figure.text(left / width, (top + 4 - line * _LINE) / height, text, fontsize=8, color=colour)
-        bottom = top - 2 * _LINE - self.pixels.shape[0]
-        low, high = self.limits
-        figure.figimage(self.pixels, left, bottom, cmap=self.colours, vmin=low, vmax=high, origin="upper")
+    def draw(self, picture: Image, left: int, top: int) -> None:
+        """Draw it so many pixels from the left and the top of the picture, which is where its text begins."""
+        from PIL import Image, ImageDraw
+
+        draw = ImageDraw.Draw(picture)
+        for line, (text, colour) in enumerate(((self.label, "black"), (self.note, "#595959"))):
+            draw.text((left, top + line * _LINE), text, colour, _font(11))
+        top += 2 * _LINE
+        shares = (self.pixels - self.limits[0]) / (self.limits[1] - self.limits[0])
+        ends = _COLOURS if self.signed else ((0,) * 3, (127.5,) * 3, (255,) * 3)
+        coloured = [np.interp(shares, (0, 0.5, 1), channel) for channel in zip(*ends, strict=True)]
+        picture.paste(Image.fromarray(np.stack(coloured, -1).astype(np.uint8)), (left, top))
         if self.bar is not None:
-            self._scale(figure, left + 6, bottom + 6, *self.bar)
+            pixel, unit = self.bar
+            length = round_length(pixel * self.pixels.shape[1] / 3)  # a third of the image at most
+            x, y = left + 6, top + self.pixels.shape[0] - 6
+            draw.line((x, y, x + length / pixel, y), _ORANGE, 4)
+            draw.text((x, y - 18), f"{length:g} {unit}", _ORANGE, _font(11, bold=True))
         if self.unseen is not None:
-            self._dial(figure, left + self.pixels.shape[1] - 6, bottom + self.pixels.shape[0] - 6, self.unseen)
+            self._dial(draw, left + self.pixels.shape[1] - 6, top + 6, self.unseen)
 
-    def _dial(self, figure: Figure, right: int, top: int, unseen: Wedge) -> None:
+    def _dial(self, draw: ImageDraw, right: int, top: int, unseen: Wedge) -> None:
         """Rays in a slice (y downwards) that no view has taken yet, as a double wedge: edges along them are unknown."""
-        from matplotlib.patches import Circle
-        from matplotlib.patches import Wedge as Sector
-
-        radius = _DIAL * min(self.pixels.shape)
-        centre = right - radius, top - radius
-        figure.add_artist(Circle(centre, radius, fill=False, ec="0.6", lw=1, transform=None))
-        first, last = (270 - math.degrees(angle) for angle in reversed(unseen))  # a ray of θ runs along -sin θ, cos θ
-        for half in (0, 180):
-            figure.add_artist(Sector(centre, radius, first + half, last + half, fc="tab:orange", transform=None))
-        width, height = figure.get_size_inches() * _DPI
-        place = (right - 2 * radius - 4) / width, (top - 12) / height
-        figure.text(*place, "rays to come", fontsize=8, color="tab:orange", ha="right")
-
-    def _scale(self, figure: Figure, x: int, y: int, pixel: float, unit: str) -> None:
-        """A bar of a round length, at most a third of the image."""
-        from matplotlib.lines import Line2D
-
-        length = round_length(pixel * self.pixels.shape[1] / 3)
-        bar = Line2D([x, x + length / pixel], [y, y], color="tab:orange", lw=3, transform=None, solid_capstyle="butt")
-        figure.add_artist(bar)
-        width, height = figure.get_size_inches() * _DPI
-        text = f"{length:g} {unit}"
-        figure.text(x / width, (y + 6) / height, text, fontsize=8, color="tab:orange", weight="bold")
+        side = 2 * _DIAL * min(self.pixels.shape)
+        place, (first, last) = (right - side, top, right, top + side), np.degrees(unseen).tolist()
+        draw.ellipse(place, outline="#999999")
+        for half in (90, 270):  # a ray of θ runs along -sin θ, cos θ
+            draw.pieslice(place, first + half, last + half, _ORANGE)
+        draw.text((right - side - 4, top), "rays to come", _ORANGE, _font(11), anchor="ra")
 
 
 def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:

@@ -363,8 +363,8 @@ def canvas(figure: Figure) -> FigureCanvasAgg:
     return FigureCanvasAgg(figure)
 
 
-def png(figure: Figure, compression: int = 6) -> bytes:
-    """The figure's bytes as PNG; `compression` 1 takes the least time, 9 gives the fewest bytes."""
+def png(figure: Figure) -> bytes:
+    """The figure as PNG."""
     buffer = io.BytesIO()
-    canvas(figure).print_png(buffer, pil_kwargs={"compress_level": compression})
+    canvas(figure).print_png(buffer)
     return buffer.getvalue()

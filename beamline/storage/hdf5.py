@@ -26,7 +26,7 @@ from beamline.core.files import is_link, same_file
 from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile, GrowingFile, UnderHdf5
 from beamline.storage.structure import require_harmless
-from beamline.storage.superblock import superblock
+from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import LockFailure, abandoned, held_sentence, lock_failure, opened_whole
 
 DEGREE = np.pi / 180
@@ -73,27 +73,19 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
-    problems, is_held = [], False
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):
         return _apart(path, follow)
-    missing = 0 if head is None else head.missing
-    being_written = head is not None and head.open_for_writing and head.intact
-    # A follower takes no lock, so as not to be taken for a writer.
-    growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
-    tries = [growing, whole, shared] if follow else [whole, growing, shared]
-    for swmr, locking in tries:
-        if swmr and (missing or not (follow or being_written)):
-            continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    problems = []
+    for swmr, locking in _ways(head, follow):
         try:
             if swmr:
                 file = h5py.File(path, "r", swmr=swmr, locking=locking)
             else:
-                file = opened_whole(path, unlocked=not being_written)
+                file = opened_whole(path, unlocked=not _being_written(head))
         except (OSError, ValueError) as error:
-            problems.append(str(error))
-            is_held = is_held or lock_failure(error) is LockFailure.HELD
+            problems.append(error)
             continue
         try:
             with readable(path):
@@ -102,21 +94,40 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             file.close()
             raise
         return file
+    raise _unopened(path, follow, head, problems)
+
+
+def _being_written(head: Superblock | None) -> bool:
+    return head is not None and head.open_for_writing and head.intact
+
+
+def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None]]:
+    """Ways to open a file, (swmr, locking), in the order in which they are tried."""
+    # A follower takes no lock, so as not to be taken for a writer.
+    growing, whole, shared = (True, False), (False, None), (True, None)
+    ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
+    # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    waits = (head is not None and head.missing) or not (follow or _being_written(head))
+    return [way for way in ways if not (way[0] and waits)]
+
+
+def _unopened(path: Path, follow: bool, head: Superblock | None, problems: list[OSError | ValueError]) -> DataError:
+    """Why none of the ways opened a file."""
     if follow:
-        raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
-    if missing:
-        raise DataError(
-            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If the disk "
-            "was full, `beamline recover` rescues its frames. Nothing was read."
+        return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
+    if head is not None and head.missing:
+        return DataError(
+            f"{path} is cut off: the last {head.missing} bytes are missing. Copy it again, or use the original. If the "
+            "disk was full, `beamline recover` rescues its frames. Nothing was read."
         )
-    if being_written:
-        raise DataError(
+    if _being_written(head):
+        return DataError(
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
             "writer died, `beamline recover` clears the mark; nothing was read."
         )
-    if is_held:
-        raise DataError(held_sentence(path))
-    raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
+    if any(lock_failure(error) is LockFailure.HELD for error in problems):
+        return DataError(held_sentence(path))
+    return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 
 def grows_here(path: Path) -> bool:

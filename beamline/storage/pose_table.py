@@ -124,45 +124,58 @@ def read_poses(text: str) -> PoseTable:
 
 def _of_csv(path: Path, content: str) -> PoseTable:
     lines = [line for line in content.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    rows = list(csv.reader(lines))
-    names = [name.strip().lower() for name in rows[0]] if rows else []
-    of_vectors = {cone: columns for cone, columns in _VECTORS.items() if columns[0] in names}
-    stated = next(iter(of_vectors.values()), (*_PIXELS, *_TURNS))
-    legal = (*_KEYS, *stated, *(() if of_vectors else _FOR_PEOPLE))
-    missing = [name for name in stated if name not in names]
-    if not set(names) & set(_KEYS) or (missing if of_vectors else len(missing) == len(stated)):
+    head, *rows = list(csv.reader(lines)) or [[]]
+    names = [name.strip().lower() for name in head]
+    cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
+    _require_header(path, names, cone)
+    columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
+    by = next(name for name in _KEYS if name in columns)
+    keys, angles = columns[by], columns.get("angle_deg")
+    _require_keys(path, columns, by)
+    if cone is not None:
+        vectors = np.stack([columns[name] for name in _VECTORS[cone]], axis=1)
+        return _of_vectors(path, by, keys, vectors, cone=cone)
+    none = np.zeros(keys.size)
+    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
+    return PoseTable(path, by, keys, angles, shifts, turns)
+
+
+def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
+    """ValueError for a first line without a key and poses, or all vectors (of a cone or not), or with other names."""
+    stated = (*_PIXELS, *_TURNS) if cone is None else _VECTORS[cone]
+    missing = set(stated) - set(names)
+    if not set(names) & set(_KEYS) or (len(missing) == len(stated) if cone is None else missing):
         raise ValueError(
             f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"{'all' if of_vectors else 'some'} of {', '.join(stated)}"
+            f"{'some' if cone is None else 'all'} of {', '.join(stated)}"
         )
-    unknown = [name for name in names if name not in legal]
-    if unknown or len(set(names)) < len(names):
-        twice = [name for name in names if names.count(name) > 1]
-        raise ValueError(
-            f"{path}: column {(unknown or twice)[0]!r} is unknown or there twice; known: {', '.join(legal)}"
-        )
-    values = np.empty((len(rows) - 1, len(names)))
-    for number, row in enumerate(rows[1:]):
+    legal = (*_KEYS, *stated, *(_FOR_PEOPLE if cone is None else ()))
+    for name in names:
+        if name not in legal or names.count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(legal)}")
+
+
+def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
+    """The table [row, column]; ValueError for cells that are no numbers, and without a row."""
+    if not rows:
+        raise ValueError(f"{path} has a header and no rows; expected one for each view")
+    values = np.empty((len(rows), len(names)))
+    for number, row in enumerate(rows):
         try:
             values[number] = [float(cell) for _, cell in zip(names, row, strict=True)]
         except ValueError:
             raise ValueError(f"{path}: {','.join(row)!r} are not {len(names)} numbers") from None
-    if not len(values):
-        raise ValueError(f"{path} has a header and no rows; expected one for each view")
-    columns = dict(zip(names, values.T, strict=True))
-    by = next(name for name in _KEYS if name in columns)
-    keys, angles = columns[by], columns.get("angle_deg")
-    for name in (by, *(() if angles is None else ("angle_deg",))):
+    return values
+
+
+def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
+    """ValueError for keys that are no whole numbers from 0 on, or angles that are not finite."""
+    for name in {by, "angle_deg"} & columns.keys():
         given = columns[name]
         bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
         if bad.any():
             kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
             raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
-    for cone, vectors in of_vectors.items():
-        return _of_vectors(path, by, keys, np.stack([columns[name] for name in vectors], axis=1), cone=cone)
-    none = np.zeros(len(values))
-    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
-    return PoseTable(path, by, keys, angles, shifts, turns)
 
 
 def _of_arrays(path: Path) -> PoseTable:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class DeviceError(Exception):
-    """A device did not obey a request.
+    """A device did not carry out a request.
 
     The message is one readable paragraph; its parts are attributes.
 
@@ -45,7 +45,7 @@ class DeviceError(Exception):
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
     def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
-        """The same error of a device that uses this one; `changed`: parts that it says differently."""
+        """The same error, reported by a device that uses this one. changed: parts of the error to replace."""
         parts = ("request", "reply", "expected", "advice", "state", "wire")
         return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
 

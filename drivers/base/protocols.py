@@ -87,7 +87,7 @@ class RotationStage(Protocol):
         """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
 
     def start_home(self) -> None:
-        """Begin the search for the reference and return at once; `wait` ends with it.
+        """Begin the search for the reference and return at once; `wait` returns when the search has ended.
 
         Raises:
             DeviceRefused: the stage has no reference, or it moves.
@@ -227,7 +227,7 @@ class ConnectedShutter(Shutter, Protocol):
     """A shutter with a connection of its own."""
 
     def disconnect(self) -> None:
-        """End it; the shutter stays as it is."""
+        """Close the connection; the shutter stays as it is."""
 
 
 class SampleMover(Protocol):
@@ -246,17 +246,17 @@ class Filter(Protocol):
     name: str
 
     def put(self, place: str) -> None:
-        """Bring it there, and return when it is. Raises DeviceError: it did not arrive."""
+        """Move the filter to a place, and return when it is there. Raises DeviceError if it did not arrive."""
 
     def place(self) -> str | None:
-        """Where it stands; None: the place has no name, or is not known. Raises DeviceError."""
+        """Name of the present place; None if it has no name or is not known. Raises DeviceError."""
 
 
 class ConnectedFilter(Filter, Protocol):
     """A filter with a connection of its own."""
 
     def close(self) -> None:
-        """End it; the filter stays where it is."""
+        """Close the connection; the filter stays where it is."""
 
 
 class Monochromator(Protocol):
@@ -265,10 +265,10 @@ class Monochromator(Protocol):
     name: str
 
     def move_to(self, energy: float) -> None:
-        """Bring it to an energy, and return when it has settled there. Raises DeviceError: it did not arrive."""
+        """Move to an energy, and return when it has settled there. Raises DeviceError if it did not arrive."""
 
     def energy(self) -> float | None:
-        """Where it stands; None: not known. Raises DeviceError."""
+        """Present energy in keV; None if it is not known. Raises DeviceError."""
 
 
 class ConnectedMonochromator(Monochromator, Protocol):
@@ -277,7 +277,7 @@ class ConnectedMonochromator(Monochromator, Protocol):
     def energy(self) -> float: ...
 
     def stop(self) -> None:
-        """Stop it where it can be stopped. Raises DeviceError."""
+        """Stop the monochromator if it can be stopped. Raises DeviceError."""
 
     def close(self) -> None:
         """End the connection; the monochromator stays where it is."""
@@ -293,7 +293,7 @@ class Watchable(Protocol):
 
 @runtime_checkable
 class Rechecked(Protocol):
-    """A device that is moved and then believed, and that can be asked whether it still stands where it did."""
+    """A device whose position is trusted after a move, and can be checked again later."""
 
     def remember_place(self) -> Callable[[], str]:
         """Note where it stands. The function returned says, whenever it is called, where it stands instead; "" if it is
@@ -315,7 +315,7 @@ class BeamMonitor(Protocol):
     name: str
 
     def reading(self) -> BeamReading:
-        """The present value, always finite. Raises DeviceTimeout, or DeviceError if the answer is not a number."""
+        """Present value, always finite. Raises DeviceTimeout, or DeviceError if the answer is not a number."""
 
     def close(self) -> None: ...
 

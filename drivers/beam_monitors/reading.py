@@ -1,4 +1,4 @@
-"""Beam monitors: the intensity is a number in a text, which a serial line, a web page or a file gives."""
+"""Beam monitors that read the intensity as a number in a text, from a serial line, a web page or a file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PATTERN = r"^\s*([+-]?[\d.]+(?:[eE][+-]?\d+)?)"
 
 @dataclass(frozen=True)
 class ElectrometerQuery:
-    """How an electrometer is read.
+    """Query of an electrometer, and the form of its reply.
 
     Attributes:
         query: command that asks for a reading; it must have no side effects, since it is also the line's probe (see

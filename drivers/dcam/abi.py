@@ -233,7 +233,7 @@ class Dcam:
         self._call("dcamcap_start", camera, mode, detail=mode.name)
 
     def cap_stop(self, camera: int) -> None:
-        """Legal in every state."""
+        """Stop the capture; legal in every state."""
         self._call("dcamcap_stop", camera)
 
     def cap_status(self, camera: int) -> CaptureState:

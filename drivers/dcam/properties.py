@@ -75,7 +75,7 @@ class Properties:
             raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
 
     def set_if_available(self, prop: Property, value: float) -> None:
-        """`set_exactly`, if the camera has the property; a camera without it behaves as if it had this value."""
+        """Call `set_exactly` if the camera has the property; one without it behaves as if it had this value."""
         if self.find(prop) is not None:
             self.set_exactly(prop, value)
 

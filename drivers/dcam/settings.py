@@ -29,7 +29,7 @@ _OPTIONAL = MappingProxyType(
 def description(
     session: Session, properties: Properties, settings: CameraSettings, options: DcamOptions
 ) -> dict[str, str | int | float]:
-    """Everything that this camera model reports of itself, by name.
+    """Identity and settings that this camera model reports, by name.
 
     Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
     missing for a camera that does not report them. `row_period` (s): how much later each row starts than the one

@@ -29,14 +29,14 @@ class PvValue:
 
     @property
     def text(self) -> str:
-        """The value without its label."""
+        """The value as text, without its label."""
         return self.value if isinstance(self.value, str) else repr(self.value)
 
     def __str__(self) -> str:
         return self.label or f"{self.value}"
 
     def is_one(self, wanted: float | str) -> bool:
-        """Whether it is this number, text or label."""
+        """Whether the value equals this number, text or label."""
         return wanted in (self.value, self.label) if self.label else self.value == wanted
 
 
@@ -59,7 +59,7 @@ class ProcessVariable(Protocol):
 
 
 def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
-    """The channel behind pva://NAME or ca://NAME. It is not asked yet.
+    """Open the channel of pva://NAME or ca://NAME, without reading it yet.
 
     Args:
         device: its name in errors.
@@ -91,7 +91,7 @@ def url_problem(url: str) -> str:
 
 
 def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> None:
-    """Raise DeviceError if the IOC does not vouch for a value."""
+    """Raise DeviceError if a value has an INVALID alarm."""
     if value.severity >= INVALID:
         raise DeviceError(
             device,
@@ -210,7 +210,7 @@ class CaChannel:
             self._errors.refused(f"{name} = {value}", result)
 
     def close(self) -> None:
-        """The process keeps its circuits: others may use them."""
+        """Close the channel; the process keeps its circuits, which others may use."""
         self._ca = None
 
     def _asked(self) -> Any:

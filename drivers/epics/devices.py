@@ -67,7 +67,8 @@ class PvShutter:
         self._put(self._closer, self._pvs.close_value, False, lambda: None)
 
     def is_open(self) -> bool:
-        """What the status says. Raises DeviceTimeout, DeviceError: it does not answer, or its alarm is INVALID."""
+        """Whether it is open by its status. Raises DeviceTimeout without an answer, DeviceError if the alarm is
+        INVALID."""
         (status,) = self._status.read("")
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)

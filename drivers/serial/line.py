@@ -38,7 +38,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class LineRules:
-    """How a device talks.
+    """Framing, probe and timing of a device's dialogue.
 
     Attributes:
         unsolicited: regular expression of lines that the device may send without a request; they are skipped and
@@ -246,9 +246,9 @@ class SerialLine:
         except serial.SerialTimeoutException as problem:
             raise self._error(
                 DeviceTimeout,
-                f"it took no bytes for {self._timeout:g} s",
+                f"it accepted no bytes for {self._timeout:g} s",
                 request=request,
-                expected="a device that takes what is sent",
+                expected="a device that accepts what is sent",
                 advice="Check power, cable and flow control (none is expected)",
                 state=state,
             ) from problem
@@ -274,7 +274,7 @@ class SerialLine:
 
 
 class Wired(Protocol):
-    """How a controller is connected, as a stage's `Wiring` says it."""
+    """Connection of a controller; a stage's `Wiring` implements it."""
 
     @property
     def timeout(self) -> float: ...
@@ -287,6 +287,6 @@ class Wired(Protocol):
 
 
 def line_to(wiring: Wired, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """The open line to the controller of the stage `name`; `rules` as in `LineRules`."""
+    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
     given: dict[str, Any] = {"timeout": wiring.timeout, "baudrate": wiring.baudrate, "transcript": wiring.transcript}
     return SerialLine(url, LineRules(probe, **rules), clock, device=name, **given)

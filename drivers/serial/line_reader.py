@@ -1,4 +1,4 @@
-"""LineReader: bytes of a port to lines and replies, with a deadline; Transcript: what was sent and received."""
+"""LineReader: lines and replies from the bytes of a port, with a deadline. Transcript: record of the dialogue."""
 
 from __future__ import annotations
 

@@ -13,12 +13,12 @@ class SettingsStore(Protocol):
     """Keeps the settings that a controller was found with, beyond the end of this program."""
 
     def load(self) -> Mapping[str, str]:
-        """What an earlier program found and did not restore; empty if it did."""
+        """Settings that an earlier program found and did not restore; empty if it did."""
 
     def save(self, found: Mapping[str, str]) -> None: ...
 
     def clear(self) -> None:
-        """All is restored."""
+        """Forget the settings: all are restored."""
 
 
 @runtime_checkable
@@ -54,7 +54,7 @@ class FoundSettings:
             )
 
     def restore(self, write: Callable[[str, str], object]) -> None:
-        """Write each of them back, once. The store keeps them if one is not taken."""
+        """Write each setting back, once. If one is refused, the store keeps them all."""
         values, self.values = self.values, {}
         for name, value in values.items():
             write(name, value)

@@ -21,7 +21,7 @@ MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
 
 
 def with_keys(name: str, driver: Any) -> Any:
-    """The driver of another package, if a configuration can write every field of its settings.
+    """Check that a configuration can write every field of the settings of another package's driver.
 
     Raises:
         ValueError: it cannot.
@@ -51,16 +51,18 @@ class StageFigures:
             raise ValueError(f"a turn cannot have {self.counts_per_turn} counts")
         for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
             if not 0 < rate * self.per_radian < MOST:
-                raise ValueError(f"{rate:g} rad is no {meaning} that a stage can have")
+                raise ValueError(f"{rate:g} rad is not a possible {meaning} of a stage")
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
             raise ValueError(f"from {low:g} to {high:g} deg there is no room to move")
         if not (self.high - self.low) * self.per_radian < MOST:
-            raise ValueError(f"{(self.high - self.low) * self.per_radian:g} counts are more than can be told apart")
+            raise ValueError(
+                f"the travel has {(self.high - self.low) * self.per_radian:g} counts, more than a float can tell apart"
+            )
 
     @property
     def per_radian(self) -> float:
-        """counts."""
+        """Counts in a radian."""
         return self.counts_per_turn / (2 * math.pi)
 
     def limits(
@@ -95,7 +97,7 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class Wiring:
-    """How a stage's controller is connected; s. The baud rate is as set on the controller, nominal over USB and TCP.
+    """Connection of a stage's controller; times in s. The baud rate is the controller's, nominal over USB and TCP.
 
     Raises:
         ValueError: no reply can come in that timeout.
@@ -117,7 +119,7 @@ class Wiring:
 
 
 class StageSettings(Protocol):
-    """The settings of a driver."""
+    """Settings of a driver, and the limits that follow from them."""
 
     @property
     def figures(self) -> StageFigures: ...

@@ -1,4 +1,4 @@
-"""What the stages of this package share: places by their travel, stops, and the wait until they stand."""
+"""Shared code of the stages: positions by their travel, stops, and the wait until they stand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drivers.stages.travel import Travel
 
 
 class Stops:
-    """`count` is the number of stops so far.
+    """Stops of a stage, so that none is lost while a move begins; `count` of them so far.
 
     A stop goes out at once, perhaps just before the move command that another thread is about to send. So the thread
     that starts a move checks after its command whether a stop came meanwhile, and sends the stop again.
@@ -68,7 +68,7 @@ Status = TypeVar("Status")
 
 
 def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[Status], bool], timeout: float) -> Status:
-    """The last status: the stage stands, or it still moves after `timeout` s.
+    """Wait until the stage stands, at most `timeout` s; the last status.
 
     Args:
         look: asks the controller, at least once.
@@ -81,7 +81,7 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
 
 
 def longest_stop(limits: StageLimits) -> float:
-    """The time in s that every stage takes to stop from its full speed, at most."""
+    """Longest time in s that any stage takes to stop from its full speed."""
     return limits.max_speed / limits.acceleration + STOP_MARGIN
 
 
@@ -108,7 +108,7 @@ def refuse_another(name: str, wanted: str | None, serial: str) -> None:
 
 
 def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
-    """The refusal of what needs a standing stage."""
+    """The error for a request that needs a standing stage, while it moves."""
     return DeviceRefused(
         name,
         f"{purpose} is not possible while it moves",

@@ -13,7 +13,7 @@ ROUNDING = 1e-6  # counts: tolerance of a spacing, because speeds in degrees are
 
 
 def counts_in(seconds: float, limits: StageLimits) -> int:
-    """Whole counts that take this long, or longer, at the stage's full speed."""
+    """Least whole counts that take at least this long at the stage's full speed."""
     return math.ceil(seconds * limits.max_speed * limits.counts_per_turn / (2 * math.pi) - ROUNDING)
 
 
@@ -25,7 +25,7 @@ def least_interval(limits: StageLimits) -> int:
 
 @dataclass(frozen=True)
 class Travel:
-    """The limits of a named stage, in counts and in words."""
+    """Limits of a named stage, in counts and in words."""
 
     name: str
     limits: StageLimits
@@ -52,7 +52,7 @@ class Travel:
         return f"{math.degrees(self.limits.low):g} to {math.degrees(self.limits.high):g} deg"
 
     def degrees(self, counts: Fraction | float) -> str:
-        """A place in words."""
+        """A position as text, in degrees."""
         return f"{float(counts) * 360 / self.limits.counts_per_turn:.4f} deg"
 
     def described(self) -> dict[str, str | int | float]:
@@ -66,7 +66,7 @@ class Travel:
         }
 
     def target(self, angle: float) -> int:
-        """The count to go to for an angle in rad.
+        """Count of the target angle in rad.
 
         Raises:
             DeviceRefused: it is beyond the soft limits.
@@ -82,7 +82,7 @@ class Travel:
         return self.to_counts(angle)
 
     def no_such_speed(self, speed: float, slowest: str) -> DeviceRefused:
-        """The refusal of a speed in rad/s."""
+        """The error for a speed, in rad/s, that the stage does not have."""
         return DeviceRefused(
             self.name,
             f"a speed of {math.degrees(speed):g} deg/s is not possible",
@@ -91,7 +91,7 @@ class Travel:
         )
 
     def refuse_train(self, train: TriggerTrain) -> None:
-        """Refuses a train without pulses or intervals, or beyond the soft limits.
+        """Refuse a train without pulses or intervals, or beyond the soft limits.
 
         Also if its pulses would merge at full speed, or are not multiples of `interval_unit` apart. The interval of a
         single pulse does not count.
@@ -104,7 +104,7 @@ class Travel:
             raise self.cannot_emit(train, advice="A lower max_speed lets pulses be closer" if close else "")
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
-        """The refusal of a train, with the conditions for trains."""
+        """The error for a train that the stage cannot emit, with the conditions for trains."""
         unit, least = self.limits.interval_unit, least_interval(self.limits)
         multiple = f" apart by a multiple of {unit} counts (a toggled output: an even number)," if unit > 1 else ""
         return DeviceRefused(
@@ -117,7 +117,7 @@ class Travel:
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
-        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`.
+        """Refuse a train whose first pulse does not lie ahead of a stage that stands at `counts`.
 
         Also if the stage is past the count before the first pulse at which the output opens.
         """
@@ -133,7 +133,7 @@ class Travel:
         raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
-        """Refuses a controller whose own limits (counts) are narrower."""
+        """Refuse a controller whose own limits (counts) are narrower."""
         if self.low < low or self.high > high:
             raise DeviceRefused(
                 self.name,
@@ -144,7 +144,7 @@ class Travel:
             )
 
     def still_moving(self, timeout: float, counts: int, aim: str, request: str, reply: str = "") -> DeviceTimeout:
-        """The error of a wait (s) that ends before the stage has arrived."""
+        """The error of a wait that ended after its timeout (s), before the stage has arrived."""
         return DeviceTimeout(
             self.name,
             f"still moving after {timeout:g} s",

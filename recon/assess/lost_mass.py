@@ -24,7 +24,7 @@ _BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a volume lost of an FBP of the same views.
+    """The matter that an FBP of the same views shows and a volume lacks.
 
     Attributes:
         lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.

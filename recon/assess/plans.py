@@ -1,4 +1,4 @@
-"""plans: method and settings for a time budget, by curves of quality against time; and the presets of a fit."""
+"""Method and settings for a time budget, by measured curves of quality against time; presets of a fit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class QualityCurve:
         return float(np.interp(math.log(steps), np.log(at), gains))
 
     def fixed(self, speeds: Speeds, further: int = 1) -> float:
-        """Seconds that it takes beside its steps, binned by a further factor."""
+        """Time in s beside the steps, with views binned by a further factor."""
         placed = (speeds.start + speeds.fill) * self.share / further**3
         finished = self.share == 0 or math.isfinite(speeds.sweep)
         sweeps, trials = (self.sweeps * speeds.sweep, speeds.trials) if self.sweeps > 0 and finished else (0.0, 0.0)

@@ -16,6 +16,6 @@ MEDIAN = 0.6745  # of |x|, for a normal variable x with standard deviation 1
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of a normal variable with the same median of absolute values; 0 where none is finite."""
+    """Standard deviation of the normal distribution with this median of absolute values; 0 if none is finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0

@@ -26,6 +26,6 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
 
 
 def factor_within(shape: tuple[int, int], voxels: int) -> int:
-    """The factor by which views [row, col] are binned, so that a volume of them has at most so many voxels."""
+    """Factor by which views [row, col] must be binned so that their volume has at most so many voxels."""
     rows, cols = shape
     return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= voxels), rows)

@@ -9,7 +9,7 @@ T = TypeVar("T")
 
 
 class Decisions:
-    """The decisions of a run by its data, by name and in order.
+    """The decisions that a run makes from its data, by name and in order.
 
     A weight of total variation, a step or a restart that follows from sums over a whole volume would differ from slab
     to slab, and show as a seam. So one slab decides, and the others follow: `Decisions(seed, first.made)`. Decisions
@@ -32,7 +32,7 @@ class Decisions:
         return value
 
     def preset(self, made: Mapping[str, Sequence[Any]]) -> None:
-        """Take these as the next decisions of their names, unless a followed run has made them."""
+        """Use these as the next decisions of their names, unless a followed run has made them."""
         for name, values in made.items():
             if len(self._followed.get(name, ())) <= len(self.made.get(name, ())):
                 self._followed = {**self._followed, name: [*self.made.get(name, ()), *values]}

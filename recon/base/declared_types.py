@@ -51,7 +51,7 @@ def types_of(owner: Any) -> Mapping[str, Any]:
 
 
 def is_number(value: object) -> bool:
-    """Whether it is a real number, or an array without axes that holds one, as an .npz gives it.
+    """Whether the value is a real number, or an array without axes that holds one, as an .npz gives it.
 
     True and False are none.
     """
@@ -60,14 +60,14 @@ def is_number(value: object) -> bool:
 
 
 def lone(value: Any) -> bool:
-    """Whether it is an array without axes, or numpy's True or False."""
+    """Whether the value is an array without axes, or numpy's True or False."""
     return isinstance(value, np.bool_) or (
         getattr(value, "shape", None) == () and hasattr(value, "item") and not isinstance(value, np.generic)
     )
 
 
 def plain(value: Any) -> Any:
-    """The number, or True or False, that an array without axes holds; others as they are."""
+    """The number or truth value in an array without axes; other values unchanged."""
     return value.item() if lone(value) else value
 
 
@@ -172,7 +172,7 @@ def _is_instance(value: Any, kind: Any) -> bool:
 
 
 def words(kind: Any, several: bool = False) -> str:
-    """What a value of a declared type is called, such as "a whole number or None"."""
+    """The name of a declared type in a sentence, such as "a whole number or None"."""
     origin, args = _parts(kind)
     if origin in (Union, UnionType):
         others = _without_arrays(args)
@@ -192,7 +192,7 @@ def words(kind: Any, several: bool = False) -> str:
 
 
 def refusal(name: str, value: Any, kind: Any) -> str:
-    """Why a value is not taken; without a full stop."""
+    """The sentence that refuses a value of the wrong type; without a full stop."""
     of = tuple(each for each in (get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)) if each)
     names = [member for each in of if get_origin(each) is Literal for member in get_args(each)]
     names += [member.value for each in of if isinstance(each, type) and issubclass(each, Enum) for member in each]
@@ -203,7 +203,7 @@ def refusal(name: str, value: Any, kind: Any) -> str:
 
 
 def shown(value: object) -> str:
-    """A value in a sentence."""
+    """A value as text within a sentence."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if (shape := getattr(value, "shape", None)) not in (None, ()):

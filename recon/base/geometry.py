@@ -45,7 +45,7 @@ _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width 
 
 
 class Where(TypedDict, total=False):
-    """Where the rotation axis falls on the detector, and how each view lies; as the attributes of `Geometry`.
+    """Position of the rotation axis on the detector, and pose of each view; as the attributes of `Geometry`.
 
     Attributes:
         axis_col, axis_row: None or left out: the middle of the detector, at (cols - 1) / 2; rows alike.
@@ -101,13 +101,13 @@ class Geometry:
             object.__setattr__(self, "centres", _frozen(np.zeros((self.angles.size, 3))))
         elif not self.is_cone or self.width.arc:
             raise ValueError(
-                "centres were given of a parallel beam, or of views that turn while they are exposed: expected a cone "
-                "without an arc. Displace the views of a parallel beam by shifts"
+                "centres need a cone beam whose stage does not turn during the exposure (no arc). Displace the views "
+                "of a parallel beam by shifts"
             )
         if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
             raise ValueError(
-                f"a skew of {self.skew:.3g} rad a row: expected a finite one, of straight views of a parallel beam. "
-                "Leave it at 0 for a cone, and for rolled or tilted views"
+                f"skew must be finite, and 0 unless the beam is parallel and no view is rolled or tilted; got "
+                f"{self.skew:.3g} rad a row"
             )
 
     @classmethod
@@ -353,7 +353,7 @@ class Geometry:
         return replace(self, roll=none, tilt=none, centres=_frozen(np.zeros((self.n_views, 3))))
 
     def scaled(self, factor: float) -> Geometry:
-        """The same with all lengths in another unit: `factor` times as many."""
+        """The same geometry with all lengths multiplied by `factor`, as in another unit."""
         lengths = {name: factor * getattr(self, name) for name in ("pixel_pitch", "sod", "sdd")}
         return replace(self, **lengths, centres=_frozen(factor * self.centres))
 
@@ -378,7 +378,7 @@ class Geometry:
         return replace(self, centres=_frozen(points))
 
     def at_row(self, row: float) -> Geometry:
-        """The same without skew: all rows at the angle of this one."""
+        """The same geometry without skew: all rows at the angle of this one."""
         return replace(self, angles=_frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
 
     def rows(self, start: int, stop: int) -> Geometry:
@@ -421,13 +421,13 @@ class Geometry:
 
 
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:
-    """All values of a geometry as arrays, by name; `geometry_of_arrays` makes it of them."""
+    """All values of a geometry as arrays, by name; `geometry_of_arrays` is the inverse."""
     values = {each.name: getattr(geometry, each.name) for each in fields(Geometry)}
     return {name: np.asarray(astuple(v) if isinstance(v, RayWidth) else v) for name, v in values.items()}
 
 
 def geometry_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> Geometry:
-    """The geometry of `arrays_of`."""
+    """The geometry with the values that `arrays_of` gives."""
     values: dict[str, Any] = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
     rows, cols = values.pop("detector_shape").tolist()
     width = RayWidth(*values.pop("width").tolist())

@@ -36,7 +36,7 @@ class Kernel(StrEnum):
             if kernel.exponent == exponent:
                 return kernel
         known = ", ".join(f"{kernel.exponent:g} ({kernel})" for kernel in cls)
-        raise ValueError(f"there is no kernel of exponent {exponent:g}, known are {known}: a newer version wrote it")
+        raise ValueError(f"no kernel has exponent {exponent:g}; known are {known}. A newer version may have written it")
 
     @property
     def is_compact(self) -> bool:
@@ -44,12 +44,12 @@ class Kernel(StrEnum):
 
     @property
     def exponent(self) -> float:
-        """m of a compact kernel; infinite for a Gaussian, which is its limit."""
+        """Exponent m of a compact kernel; infinite for a Gaussian, which is its limit."""
         return 1.5 if self.is_compact else math.inf
 
     @property
     def radius(self) -> float:
-        """R, where the kernel ends, in standard deviations."""
+        """Radius R at which the kernel ends, in standard deviations."""
         return math.sqrt(2 * self.exponent + 5)
 
     @property
@@ -66,5 +66,5 @@ class Kernel(StrEnum):
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:
-        """Where it is cut off, in standard deviations: a Gaussian at `sigmas`, a compact kernel at its end."""
+        """Radius in standard deviations at which it is cut off: a Gaussian at `sigmas`, a compact kernel at its end."""
         return self.radius if self.is_compact else sigmas

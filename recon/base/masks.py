@@ -57,7 +57,7 @@ def plan_fill(mask: Mask) -> Fill:
 
 
 def areas(mask: Mask) -> Mask:
-    """[row, col] masked pixels that lie in an area of 3 x 3 or more, the detector's edges counting as masked.
+    """Masked pixels [row, col] within an area of 3 x 3 or more; beyond the detector's edges all counts as masked.
 
     Their fill values are guesses. A single pixel or a line is interpolated well.
     """

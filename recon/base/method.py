@@ -32,7 +32,7 @@ Clock = Callable[[], float]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a reconstruction stands.
+    """State of a running reconstruction, as `RunControl` reports it.
 
     Attributes:
         step, steps: done and planned, or iterations (0: unknown, as in a fit while views still arrive).
@@ -62,7 +62,7 @@ SWEEPS_OF_TRIALS = "sweeps of trials"
 
 @dataclass(frozen=True, eq=False)
 class Energies:
-    """The energies of views, and what pure materials attenuate there.
+    """The energy of each view, and the attenuation of the pure materials at these energies.
 
     Attributes:
         of_view: [view] index of the energy of each.
@@ -131,16 +131,16 @@ class RunControl:
 
     @property
     def stop(self) -> Stop:
-        """Whether to end with the volume so far."""
+        """Asks whether the run should end with the volume so far."""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """Whether to end the trials."""
+        """Asks whether the trials should end."""
         return self.stop_trials or self.stop
 
     def by(self, deadline: float) -> RunControl:
-        """The same, which ends when the clock shows the deadline, at the latest."""
+        """The same control with a deadline by its clock."""
         return replace(self, should_stop=self.stop.by(deadline, self.now))
 
 
@@ -166,7 +166,7 @@ class ReconProblem:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a reconstruction ended, and from where it went on.
+    """How a reconstruction ended, and the step from which it was resumed.
 
     Attributes:
         early: it was stopped, and has the volume reached by then.
@@ -273,7 +273,7 @@ class Traits:
 
     @property
     def several(self) -> bool:
-        """It makes several volumes, which all views determine together."""
+        """Whether the method makes several volumes, which all views determine together."""
         return self.in_time or self.by_energy
 
 
@@ -298,10 +298,10 @@ class Method(Protocol):
         """
 
     def toy(self) -> Self:
-        """The same method with as little work as still runs each of its kernels."""
+        """The same method with the least work that still runs each of its kernels."""
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Most bytes that `run` takes beside the projections, and beside their weights if they are `weighted`."""
+        """Peak memory of `run` in bytes, without the projections, and without their weights if they are `weighted`."""
 
 
 class JointMethod(Method, Protocol):
@@ -309,11 +309,11 @@ class JointMethod(Method, Protocol):
 
     @property
     def volumes(self) -> int:
-        """How many it makes."""
+        """Number of its volumes."""
 
     @property
     def volume_names(self) -> tuple[str, ...]:
-        """Of the materials; empty where volumes are of times."""
+        """Names of the materials; empty if its volumes are of times."""
 
 
 @runtime_checkable
@@ -334,7 +334,7 @@ class PresetMethod(Method, Protocol):
 
 @runtime_checkable
 class TimedMethod(Method, Protocol):
-    """A method that ends by itself when a time is over."""
+    """A method that ends by itself within a given time."""
 
     def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
         """Start the method on these views; the result runs within the seconds that are then `left`."""
@@ -354,7 +354,7 @@ class BoundedMethod(Method, Protocol):
 
     @property
     def seconds(self) -> float | None:
-        """None: the time does not end it."""
+        """Time limit of the run in s; None: no limit."""
 
 
 @runtime_checkable
@@ -363,7 +363,7 @@ class EarlyStopMethod(Protocol):
 
     @property
     def early_stop(self) -> bool:
-        """They do."""
+        """Whether they may end it."""
 
 
 @runtime_checkable
@@ -372,7 +372,7 @@ class SignedMethod(Protocol):
 
     @property
     def allow_negative(self) -> bool:
-        """It keeps them."""
+        """Whether it keeps negative voxels."""
 
 
 @runtime_checkable
@@ -381,7 +381,7 @@ class ListedMethods(Protocol):
 
     @property
     def candidates(self) -> tuple[Method, ...]:
-        """By preference."""
+        """The methods, the preferred one first."""
 
 
 @runtime_checkable
@@ -398,15 +398,15 @@ class CheckpointedMethod(Method, Protocol):
 
 
 def volumes_of(method: Any) -> int:
-    """How many volumes a method makes."""
+    """Number of volumes that a method makes."""
     return int(method.volumes) if method.traits.several else 1
 
 
 def volume_names_of(method: Any) -> tuple[str, ...]:
-    """Names of the volumes of a method where each is of a material; otherwise empty."""
+    """Names of the materials whose volumes a method makes; empty for other methods."""
     return tuple(method.volume_names) if method.traits.several else ()
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:
-    """The methods that it chooses among, by preference; only itself if it does not choose."""
+    """The methods that `method` chooses among, the preferred one first; itself if it does not choose."""
     return method.candidates if isinstance(method, ListedMethods) else (method,)

@@ -8,7 +8,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Lengths:
-    """Lengths of a method that a comparison tries.
+    """Numbers of iterations or steps that a comparison tries of a method.
 
     Attributes:
         setting: "iterations" or "steps".
@@ -24,7 +24,7 @@ class Lengths:
 
 @dataclass(frozen=True)
 class MethodEntry:
-    """Where a method is.
+    """Where the settings class of a method is, and when it is compared with others.
 
     Attributes:
         module, cls: of its settings class, see `recon.base.method.Method`.

@@ -56,7 +56,7 @@ def noise_level(images: F32) -> float:
 
 
 def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
-    """`noise_level`, or what is less: the noise where no sample has structure.
+    """The smaller one of `noise_level` and the noise at frequencies where no sample has structure.
 
     While the stage turns by an angle, a point at most R pixels off the axis moves by R times this angle at most. So a
     sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
@@ -222,7 +222,7 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
         ]
         if top - max(valleys) >= prominence:
             return int(first + last) // 2
-    raise ValueError("the curve has no such peak")
+    raise ValueError("the curve has no peak of this height and prominence")
 
 
 def _long_axes(images: F32) -> list[int]:

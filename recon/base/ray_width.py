@@ -1,4 +1,4 @@
-"""RayWidth: what one pixel sees beside its central ray, while one view is exposed."""
+"""RayWidth: the rays that a pixel averages during one exposure, beside its central ray."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from recon.base.settings_check import check_settings
 
 @dataclass(frozen=True)
 class RayWidth:
-    """How far a pixel's signal is spread on the detector, and how far the stage turns meanwhile; 0: a ray.
+    """Spread of a pixel's signal on the detector, and turn of the stage during the exposure; 0: a single ray.
 
     Attributes:
         pixel: side in pixels of the square over which a pixel averages; 1: its own area.
@@ -29,7 +29,7 @@ class RayWidth:
 
     @property
     def variance(self) -> float:
-        """Of the spread along columns, and along rows, in px²."""
+        """Variance of the spread along columns, and along rows, in px²."""
         return self.pixel**2 / 12 + self.blur**2
 
     def binned(self, factor: int) -> RayWidth:

@@ -1,4 +1,4 @@
-"""What every settings class checks of its values, with one sentence for each kind of them."""
+"""Checks of settings classes: types and bounds of their fields, with one sentence for each kind of error."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
 
 
 def slices_of(grid: Grid, slices: slice) -> Grid:
-    """These slices of a grid, where they are."""
+    """The grid of these slices, at their place in the whole grid."""
     off = ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
     centre = (grid.centre[0] + off, *grid.centre[1:])
     return replace(

@@ -1,4 +1,4 @@
-"""Stop: how a caller ends work before its end, by asking or by a time."""
+"""Stop: a request and a deadline, by which a caller ends work early."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Self
 
 
 class Stop:
-    """Whether work should end with what it has reached; it is called for that between steps.
+    """Request to end work with what it has reached; the work calls it between steps.
 
     Args:
         asks: True ends the work, and it is not asked again.
@@ -36,11 +36,11 @@ class Stop:
         return self.stopped
 
     def by(self, deadline: float, now: Callable[[], float]) -> Self:
-        """The same, and by the deadline at the latest."""
+        """The same request with a deadline."""
         return type(self)(self, deadline, now)
 
     def leaves(self, seconds: float) -> bool:
-        """Whether so many s are left before this one's own deadline."""
+        """Whether at least so many s remain before its own deadline."""
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:

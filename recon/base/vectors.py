@@ -89,7 +89,7 @@ def vectors_of(geometry: Geometry) -> F64:
     """
     check_arguments(vectors_of, locals())
     if geometry.skew:
-        raise ValueError("the rows of these views stand at angles of their own, which vectors of a view cannot say")
+        raise ValueError("vectors hold one angle a view, but these views have a skew: an angle for each row")
     rows, cols = geometry.detector_shape
     axes = np.array([geometry.axes(view) for view in range(geometry.n_views)])
     along_cols, along_rows, beam = axes.transpose(1, 0, 2)

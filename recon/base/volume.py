@@ -230,16 +230,16 @@ class VolumeSeries:
 
     @property
     def n(self) -> int:
-        """How many they are."""
+        """Number of volumes."""
         return len(self.names) or len(self.seconds)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A short text on each, for people."""
+        """A short name of each volume: its material or its time."""
         return self.names or tuple(f"{at:.4g} s" for at in self.seconds)
 
     def each(self) -> list[Any]:
-        """The volumes, which are read where they are sliced along z."""
+        """The volumes one by one; each reads its voxels only when it is sliced along z."""
         return [_VolumeAt(self.data, at) for at in range(self.n)]
 
 

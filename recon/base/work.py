@@ -1,4 +1,4 @@
-"""Work: what a reconstruction computes, counted in operations that a machine's speed is measured in.
+"""Work: the operations that a reconstruction computes, counted as a machine's speed is measured.
 
 A method says what it does in these terms (`costs`, beside its `memory`); `recon.machine_speed` measures how long each
 operation takes; `seconds_of` multiplies the two. Nothing else predicts a time.
@@ -22,7 +22,7 @@ CLOCK = "clock"
 
 
 class Rate(NamedTuple):
-    """s of an operation for each unit of its two amounts."""
+    """Seconds that an operation takes for each unit of its two amounts."""
 
     first: float
     second: float
@@ -55,7 +55,7 @@ class Work:
     __rmul__ = __mul__
 
     def seconds(self, rates: Rates) -> float:
-        """s on a machine with these rates."""
+        """Seconds of this work on a machine with these rates."""
         total = 0.0
         for name, (first, second) in self.amounts.items():
             rate = Rate(1.0, 0.0) if name == CLOCK else rates(name)
@@ -78,7 +78,7 @@ class Costs:
 
 
 class Span(NamedTuple):
-    """s that a run takes.
+    """Shortest and longest expected time of a run, in s.
 
     Attributes:
         least: where the data choose what takes least.
@@ -91,14 +91,15 @@ class Span(NamedTuple):
 
 @runtime_checkable
 class CostedMethod(Protocol):
-    """A method that says what it computes. The time of others is not known before they are tried."""
+    """A method that states its operations. The time of other methods is not known before they are tried."""
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """Its work on these views, for a usual scan: the number of trials of a weight, say, depends on the data."""
+        """Its work on these views of a usual scan; what depends on the data, such as the trials of a weight, may
+        differ."""
 
 
 def parts_of(geometry: Geometry, heights: Sequence[int]) -> list[tuple[Geometry, Grid]]:
-    """Views and voxels of slabs of so many slices, of a beam whose rows show slices; of others there is one."""
+    """Views and voxels of each slab, where rows show slices; of other beams the one part with all."""
     grid = Grid.matching(geometry)
     if len(heights) == 1 and heights[0] == grid.shape[0]:
         return [(geometry, grid)]
@@ -108,7 +109,7 @@ def parts_of(geometry: Geometry, heights: Sequence[int]) -> list[tuple[Geometry,
 
 
 def costs_of(method: Any, parts: Sequence[tuple[Geometry, Grid]], decided: bool = False) -> Costs | None:
-    """The work of a volume that is made in so many parts, one after the other; None: the method does not say.
+    """The work of a volume that is made in parts, one after the other; None: the method does not state it.
 
     Args:
         parts: views and voxels of each slab.
@@ -130,7 +131,7 @@ def costs_of(method: Any, parts: Sequence[tuple[Geometry, Grid]], decided: bool 
 
 
 def seconds_of(costs: Costs, rates: Rates) -> Span:
-    """s of such work on a machine with these rates."""
+    """Seconds of this work on a machine with these rates."""
     choice = costs.choice.seconds(rates)
     each = [choice + work.seconds(rates) for work in costs.volumes.values()]
     return Span(min(each), max(each))

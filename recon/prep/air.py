@@ -76,7 +76,7 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:
-    """Transmission of the air across each view [view, col]: 1 without air columns.
+    """Transmission of the air across each view [view, col], from its air columns; 1 without any.
 
     Medians of the two sides, and the line through them: a beam that moved or changed its shape since the flat tilts it.
     """

@@ -124,7 +124,7 @@ def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Float
     """Slopes along the columns [pair, row, col - 1] of some rows of views, and of opposite views, negated."""
     first, opposite = _opposite_pairs(np.asarray(angles, np.float64), projections.shape[2])
     if first.size < _FEWEST_PAIRS:
-        raise ValueError(f"{first.size} pairs of views half a turn apart; {_FEWEST_PAIRS} are needed")
+        raise ValueError(f"found {first.size} pairs of views half a turn apart; at least {_FEWEST_PAIRS} are needed")
     some = np.unique(np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(int))
     first, opposite = first[some], opposite[some]
     data = few_rows(projections[np.concatenate((first, opposite))])

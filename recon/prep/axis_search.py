@@ -54,7 +54,7 @@ def few_rows(data: NDArray[np.floating]) -> Floats:
 
 
 def lowest(candidates: Floats, curve: Floats) -> tuple[float, int]:
-    """Position of the minimum, by a parabola through three points, and its index."""
+    """Position of the minimum of a curve, by a parabola through three points, and the index of its lowest point."""
     i = int(curve.argmin())
     if not 0 < i < curve.size - 1:
         return float(candidates[i]), i

@@ -57,13 +57,13 @@ class Background:
     level: float
 
     def confirmed(self, noise: float) -> bool:
-        """It is large enough, and in air outside its fit it leaves little more than the noise of binned rays."""
+        """Whether it is large enough, and leaves little more than noise in air that was not fitted."""
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
     @property
     def may_be_matter(self) -> bool:
-        """It is positive: it looks like weak matter all around the sample, which a volume can hold."""
+        """Whether it is positive: weak matter all around the sample would look the same."""
         return self.level > 0
 
     def remove(self, views: F32, factor: int = 1) -> None:
@@ -82,7 +82,7 @@ def surface(terms: F64, shape: tuple[int, int], factor: int = 1) -> F32:
 
 
 def coordinate(n: int, factor: int = 1) -> F64:
-    """-1 to 1 across n pixels, at the centres of bins of so many."""
+    """Coordinates from -1 to 1 across n pixels, at the centres of bins."""
     return (2 * np.arange(n // factor) * factor + factor - n) / n
 
 
@@ -92,7 +92,7 @@ def powers(order: int) -> list[tuple[int, int]]:
 
 
 def matter(volume: F32, inside: Mask) -> Mask:
-    """bool [z, y, x]: voxels near matter, which stands out of the air of the smoothed volume by five of its deviations.
+    """Voxels near matter, bool [z, y, x]: the smoothed volume exceeds its air by five standard deviations there.
 
     Args:
         inside: bool [y, x], voxels that all views see, without the rim of that circle.
@@ -103,7 +103,7 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums of views over their air. They suffice to fit polynomials of any order to any number of views."""
+    """Sums over the air of views, which are all that fits of polynomials of any order need."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
         """For views of a detector (rows, cols), binned by a factor."""
@@ -117,7 +117,7 @@ class AirSums:
         self._totals: list[list[tuple[float, float, float]]] = []  # [view][half]: rays, sum and sum of squares
 
     def add(self, view: F32, air: Mask) -> None:
-        """A view [row, col], binned, and which of its rays miss the sample."""
+        """Add a binned view [row, col], and a mask of its rays that miss the sample."""
         air = self._without_outliers(view, air)
         parts = []
         for half in (self._half, ~self._half):

@@ -150,7 +150,7 @@ class Correction:
 
     @property
     def waiting(self) -> bool:
-        """The newest view waits for the one after it."""
+        """Whether the newest view waits for the one after it."""
         return self._waiting is not None
 
     def provisional(self) -> Projections | None:
@@ -231,7 +231,7 @@ class Correction:
         return np.where(self.masked, np.float32(1), level * self._dynamic.flat_of(view / level, self._settings.floor))
 
     def survey(self, views: Transmission) -> None:
-        """Let the views take part in finding the air columns."""
+        """Use the views in the search for air columns."""
         if self._settings.air == "auto":
             self._profiles.append(edge_profiles(views.data))
             self._surveyed.append(views.view_ids)
@@ -356,7 +356,7 @@ def correct(
 
 
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
-    """Batches of one scan's views as one. The list is emptied meanwhile, so that no view is in memory twice for long.
+    """Join batches of a scan's views. The list is emptied meanwhile, so that few views are in memory twice.
 
     The air columns and the mask are those of the last batch.
 

@@ -83,7 +83,7 @@ class Counts:
             raise ValueError("the flat is nowhere above the dark: there is no beam")
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Three images [row, col] of a view: photons counted, photons without the sample, both above v, and v.
+        """Images [row, col] of a view: photons counted and photons without the sample, each plus v, and v itself.
 
         Pixels where the flat is not above the dark have 0 photons without the sample; NaN counts stay NaN.
         """
@@ -97,7 +97,7 @@ class Counts:
 
 
 def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
-    """Line integrals and weights whose weighted squares are the likelihood to second order, element by element.
+    """Line integrals and weights whose weighted squares equal the likelihood to second order, pixel by pixel.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
     is Σ λ - n ln λ. At p0 it has the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information. p~

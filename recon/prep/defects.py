@@ -54,7 +54,7 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
 
 
 def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
-    """Mask [row, col] of areas that no view lights though the flats do: a part of the instrument stands in the beam.
+    """Mask [row, col] of areas that are lit in the flats but in no view: a part of the instrument is in the beam.
 
     Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
     rotation axis darkens the middle, which does not count. Opaque matter that covers an edge in all views counts: its

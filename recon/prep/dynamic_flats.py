@@ -43,7 +43,7 @@ class DynamicFlats:
     components: F32
 
     def rows(self, rows: slice) -> DynamicFlats:
-        """The same of some detector rows."""
+        """The dynamic flats of some detector rows."""
         return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
@@ -133,12 +133,12 @@ def find_dynamic_flats(
 
 
 def search_memory(flats: int, pixels: int) -> int:
-    """Most bytes that `find_dynamic_flats` takes, with the components; `pixels` of a flat."""
+    """Peak memory of `find_dynamic_flats` in bytes, with the components; `pixels` of a flat."""
     return 4 * pixels * (_MOST + 16) + 8 * flats * 6 * min(pixels, 2 * _SAMPLED)
 
 
 def view_memory(flats: int, pixels: int) -> int:
-    """Most bytes that the components take, with the weights of a view by them."""
+    """Peak memory in bytes of the components, and of finding the weights of a view."""
     components, samples = min(_MOST, flats), min(2 * pixels, 3 * _SAMPLED // 2)
     return 4 * pixels * (4 * components + 14) + 8 * samples * (3 * components + 8)
 

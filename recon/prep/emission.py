@@ -1,4 +1,4 @@
-"""Emission: what was counted of a sample that emits (PET, SPECT), and the line integrals that methods get of it."""
+"""Emission: counts of a sample that emits (PET, SPECT), and their line integrals for any method."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FEWEST = 0.5  # counts of a line's mean, at least
 
 @dataclass(frozen=True, eq=False)
 class Emission:
-    """Counts of lines of response, binned as parallel views, and what their mean holds beside the activity.
+    """Counts along lines of response, binned as parallel views, with scatter, randoms and survival.
 
         mean = survival * A activity + background
 
@@ -47,7 +47,7 @@ class Emission:
                 raise ValueError(f"{name} must be finite and 0 or more, got {values.min()} to {values.max()}")
 
     def summed(self, views: I64, geometry: Geometry) -> Emission:
-        """Counts of some of these views, or of neighbours that count as one view; activity keeps its scale.
+        """Sums of the counts of neighbouring views, each sum as one view; the activity keeps its scale.
 
         Args:
             views: [view, window], numbers of the views that are added.

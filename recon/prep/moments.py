@@ -1,4 +1,4 @@
-"""moments_of: what the moments of parallel views say of their axis, heights and angles, whatever the sample is."""
+"""Moments of parallel views: errors of their axis, heights and angles, whatever the sample is."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _UPSIDE_DOWN = 16.0  # squared distance to the first view's profile over that to
 
 @dataclass(frozen=True, eq=False)
 class ViewMoments:
-    """What moments of views say, with standard deviations; NaN where too few rows or views tell.
+    """Errors that the moments of views show, with standard deviations; NaN where rows or views are too few.
 
     Attributes:
         axis_col: the rotation axis, in columns.

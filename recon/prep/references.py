@@ -44,7 +44,7 @@ class References:
         object.__setattr__(self, "flats", flats)
 
     def rows(self, rows: slice) -> References:
-        """The same of some detector rows."""
+        """The references of some detector rows."""
         flats = tuple((position, flat[rows]) for position, flat in self.flats)
         dynamic = None if self.dynamic is None else self.dynamic.rows(rows)
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
@@ -60,7 +60,7 @@ def _mean(frames: Image, what: str) -> Image:
 
 
 def check(references: References) -> None:
-    """Raises ValueError where there are no flats, shapes disagree, or two groups of flats have one position."""
+    """Raise ValueError if there are no flats, shapes disagree, or two groups of flats have the same position."""
     if not references.flats:
         raise ValueError("there is no flat: without one, counts cannot be converted to line integrals")
     shape = np.shape(references.dark)
@@ -87,7 +87,7 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
 
 
 def flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Net flat at a frame's position: interpolated between groups of its part; beyond them, the nearest group."""
+    """Flat without its dark at a frame's position: interpolated between groups of its part, beyond them the nearest."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]

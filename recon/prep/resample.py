@@ -58,7 +58,7 @@ class Distortion:
         return cls(col, row, tuple(factors))
 
     def seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
-        """Where (col, row) are seen."""
+        """Position on the detector at which the lens shows (col, row)."""
         x, y = col - self.col, row - self.row
         r = np.hypot(x, y)
         scale = np.polynomial.polynomial.polyval(r, self.factors)
@@ -84,7 +84,7 @@ class Resampling:
 
     @property
     def reach(self) -> int:
-        """Distance in binned rows up to which others influence a row."""
+        """Distance in binned rows from which a row takes values."""
         rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
         seen = self._seen_at(*np.meshgrid(cols, rows))[1]
         return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2

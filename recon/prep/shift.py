@@ -28,7 +28,7 @@ KNOWN = 0.25
 
 @dataclass(frozen=True)
 class ViewShift:
-    """By how much a view is displaced against another: pixels towards higher columns, and towards higher rows.
+    """Displacement of a view against another: pixels towards higher columns, and towards higher rows.
 
     Each has its uncertainty by noise (one standard deviation). NaN: the views do not tell it, as with rows all alike.
     """

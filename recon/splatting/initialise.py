@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from recon.base.binning import bin_views
 from recon.base.choices import Filter
 from recon.base.choices import Start as Start
-from recon.base.empirical import EMPTY, SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
+from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.masks import masked
@@ -24,6 +24,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
 from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector, volume_lines
@@ -130,26 +131,11 @@ def place(
         pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
         coarse = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
         volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start.kind)
-    radius = math.inf if leaves_the_field(projections, geometry) else geometry.reach
+    radius = math.inf if wider_than_field(projections, geometry) else geometry.reach
     if start.kind == "published":
         return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
-
-
-def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bool:
-    """Whether the sample is wider than the field: projections [view, row, col] do not fall to zero at their edges.
-
-    Only edges far from the rotation axis count: with the axis far off the detector's middle, opposite views see the
-    region beyond the nearer edge.
-    """
-    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.offsets[:, 0]
-    away = np.stack((axis + 0.5, cols - 0.5 - axis), 1)
-    width = max(2, cols // 50)
-    edges = np.stack((projections[..., :width].mean(axis=(1, 2)), projections[..., -width:].mean(axis=(1, 2))), 1)
-    inside = float(np.median(projections.mean(axis=(1, 2))))
-    far = away >= away.max(axis=1, keepdims=True) if geometry.is_off_middle else np.ones_like(away, np.bool_)
-    return bool(np.median(edges[far]) > EMPTY * inside)
 
 
 def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -31,7 +31,6 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     default_count,
     first_volume,
-    leaves_the_field,
     place,
     sample_gaussians,
     scale_to_data,
@@ -39,6 +38,7 @@ from recon.splatting.initialise import (
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.shown import HeldOutErrors, ShownVolume
+from recon.voxels.field_edges import wider_than_field
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
@@ -338,7 +338,7 @@ class StreamingFit:
         """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual."""
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
-        wider = leaves_the_field(data, geometry)
+        wider = wider_than_field(data, geometry)
         field = Grid.for_fit(self._template, self._grid, wider=wider)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
         rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)

@@ -39,7 +39,6 @@ from recon.splatting.initialise import (
     FirstVolume,
     default_count,
     joined_for,
-    leaves_the_field,
     mean_change,
     place,
     sweeps_of_start,
@@ -48,6 +47,7 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import MODEL_STEPS, FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxelize
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.methods.pnp_dct import PnpDct
@@ -163,7 +163,7 @@ class _Views:
         )  # fmt: skip
         measured, trusted = data[used], None if weights is None else weights[used]
         p, p_weights, seen = join_pixels(measured, trusted, views, joined)
-        field = Grid.for_fit(seen, problem.grid, wider=leaves_the_field(measured, views))
+        field = Grid.for_fit(seen, problem.grid, wider=wider_than_field(measured, views))
         fitted = replace(problem, projections=measured, geometry=all_geometry.select(used), use=DataUse(trusted))
         return cls(all_geometry, data, weights, used, kept_back, joined, seen, p, p_weights, field, count, fitted)
 

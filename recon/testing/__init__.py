@@ -39,7 +39,7 @@ def problem() -> ReconProblem:
     """A small box of 0.2 /mm, off the axis."""
     truth = np.zeros(GRID.shape, np.float32)
     truth[BOX] = 0.2
-    return ReconProblem(Projector(VIEWS, GRID).forward(truth), VIEWS, GRID, DataUse(), 3, "cpu")
+    return ReconProblem(Projector(VIEWS, GRID).plain.forward(truth), VIEWS, GRID, DataUse(), 3, "cpu")
 
 
 _WHOLE: dict[str, Reconstruction] = {}

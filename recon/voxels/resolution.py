@@ -42,11 +42,14 @@ class Resolution:
         interpolation: [view, 3], variance along these axes of a ray's interpolation, in squares of an edge. It is that
             of all distances, but for a parallel beam along the planes' normal, whose rays keep theirs.
         views: variance of a pixel in px², and of the detector's blur.
+        of_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are not:
+            a slab would depend on the rows beside it, and views that lean a little on how much.
     """
 
     voxels: F64
     interpolation: F64
     views: tuple[float, float]
+    of_rows: bool
 
     @classmethod
     def of(cls, geometry: Geometry, grid: Grid) -> Resolution:
@@ -59,7 +62,7 @@ class Resolution:
         interpolation = _interpolation(geometry, grid, axes)
         width = geometry.width
         views = (width.pixel or 1.0) ** 2 / 12, width.blur**2
-        return cls(np.abs(axes[:, :2]) * edges[:, None], interpolation, views)
+        return cls(np.abs(axes[:, :2]) * edges[:, None], interpolation, views, geometry.is_cone)
 
     def select(self, views: NDArray[np.intp]) -> Resolution:
         """Of these views, in their order."""
@@ -76,7 +79,8 @@ class Resolution:
     @property
     def sharpened(self) -> F64:
         """[view, 2] px², that the model takes off its projections; negative: that it adds to them."""
-        return np.where(self.excess > 0, SHARPENED * np.minimum(self.excess, _MOST), self.excess)
+        most = np.array([_MOST, _MOST if self.of_rows else 0.0])
+        return np.minimum(np.where(self.excess > 0, SHARPENED * self.excess, self.excess), most)
 
     @property
     def smoothed(self) -> F64:

@@ -113,12 +113,8 @@ def _fit(**settings: Any) -> recon.R2:
 
 
 REMOVED: dict[str, Removed] = {
-    "AIR": Removed(0.0, ALL),
-    "TRIAL_SWEEPS": Removed(8, PATCHES),
-    "TRIAL_STEPS": Removed(35, PATCHES),
+    "SHARPENED": Removed(0.0, (*ALL, "shell, cone")),
     "TRIAL_THRESHOLD": Removed(1.0, PATCHES),
-    "FIRST_SHARE": Removed(1.0, ALL),
-    "FAR_BEHIND": Removed(math.inf, ALL),
     "FIRST_THRESHOLD": Removed(1.0, ("12 shell", "12 foam", "12 bone", "12 cement"), recon.PnpDct()),
     "PULL": Removed(0.3, PATCHES),
     "FALL": Removed(1.0, PATCHES),

@@ -22,7 +22,6 @@ from recon.base.greys import matter_window
 
 F32 = NDArray[np.float32]
 MOST_IMAGES = 600  # of a film: of more slices or views every second, third ... is shown
-LONGEST_SIDE = 2048  # pixels of an image
 HELD_BYTES = 2**28  # bytes of the images across y or x that one pass over the volume fills
 _LOOKED_AT, _VALUES = 9, 2**18  # slices or views, and values of each, that tell the grey window
 _GIF_TICK = 0.01  # s; a GIF states the time of an image in whole ones

@@ -178,7 +178,7 @@ def _run(
                 if not slices:
                     raise
             rows = cut[0].selection.rows
-        scores = scores_of(slices)
+        scores = scores_of(slices, direct=first.method.traits.direct)
         for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
             warn(sentence)
         where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"

@@ -32,7 +32,7 @@ from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import Resolution
 
-_FLAT = 0.05  # share by which a residual must change among the values: an axis of 0.7 columns off changed it by 0.03
+_FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
 
@@ -76,10 +76,12 @@ class Scores:
     Attributes:
         residuals: [slice, view] root mean square, as a share of that of all these views.
         corrected_alike: all options give the same views; else each volume is compared with the views by all of them.
+        direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
     """
 
     residuals: F64
     corrected_alike: bool
+    direct: bool = False
 
     @property
     def shares(self) -> F64:
@@ -88,8 +90,9 @@ class Scores:
 
     @property
     def best(self) -> int | None:
-        """The slice of the least residual; None where the residual hardly depends on the values."""
-        return int(np.argmin(self.shares)) if np.ptp(self.shares) > _FLAT * self.shares.min() else None
+        """The slice of the least residual; None where that of a direct method hardly depends on the values."""
+        flat = self.direct and np.ptp(self.shares) <= _FLAT * self.shares.min()
+        return None if flat else int(np.argmin(self.shares))
 
     @property
     def alike(self) -> list[bool]:
@@ -211,7 +214,7 @@ def _held_out(prepared: PreparedProjections) -> HeldOutViews:
     return HeldOutViews(held.held_out_ids, data, held)
 
 
-def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
+def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores | None:
     """How well each volume predicts the views that none has learnt from; None where their pixels, or views, differ.
 
     A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
@@ -239,4 +242,4 @@ def scores_of(slices: Sequence[SweptSlice]) -> Scores | None:
         scale += float(np.sqrt(own.mean()))
     if scale == 0:
         raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
-    return Scores(residuals / scale, alike)
+    return Scores(residuals / scale, alike, direct)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ from recon.prep.emission import weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
-_VALUES = "values.pickle"
+_VALUES, _REFERENCE, _REGIONS = "values.pickle", "reference_", "regions.npy"
 _SMALL = 4096  # bytes of an array that needs no file of its own
 
 
@@ -35,14 +35,14 @@ class TrialData:
             both, without what the monitor says of views: trials are compared by all rays alike.
         truth: the volume [z, y, x] on Grid.matching(geometry).
         shown_held_out: [view] of those held out as `shown` of the others; None: 0.
-        reference: a volume on the same grid that every trial is compared with, in addition to the truth; or None.
+        references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
         regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
     """
 
     prepared: PreparedProjections
     truth: F32 | None
     shown_held_out: F64 | None = None
-    reference: F32 | None = None
+    references: Mapping[str, F32] = field(default_factory=dict)
     regions: NDArray[np.int8] | None = None
 
     @property
@@ -95,8 +95,19 @@ class TrialData:
             unpickler = pickle.Unpickler(file)  # noqa: S301 - written by the process that started this one
             unpickler.persistent_load = lambda number: np.load(folder / f"{number}.npy", mmap_mode="r")  # type: ignore[method-assign]
             data: TrialData = unpickler.load()
-        later = {name: folder / f"{name}.npy" for name in ("reference", "regions")}  # made after the others were saved
-        return replace(data, **{name: np.load(path) for name, path in later.items() if path.exists()})
+        made = {path.stem.removeprefix(_REFERENCE): np.load(path) for path in folder.glob(f"{_REFERENCE}*.npy")}
+        regions = folder / _REGIONS  # these were made after the others were saved
+        return replace(data, references=made, regions=np.load(regions) if regions.exists() else None)
+
+
+def write_reference(folder: Path, method: str, volume: F32) -> None:
+    """A volume that trials of the method are compared with, beside data that were saved."""
+    write_array(folder / f"{_REFERENCE}{method}.npy", volume)
+
+
+def write_regions(folder: Path, regions: NDArray[np.int8]) -> None:
+    """The dense and the empty regions, beside data that were saved."""
+    write_array(folder / _REGIONS, regions)
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:

@@ -101,8 +101,7 @@ def dry_run(
     data, planned = plan(warn)
     table = planned.table
     trials = [table.outcomes[n].trial for n in table.todo]
-    if planned.reference is not None:
-        trials = [planned.reference, *trials]
+    trials = [*planned.references, *trials]
 
     at_most = expected_seconds(data.geometry, rates)
 

@@ -6,7 +6,7 @@ import math
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
 from beamline.core.files import refuse_existing
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
-from beamline.features.trials.data import TrialData, write_array
+from beamline.features.trials.data import TrialData, write_reference, write_regions
 from beamline.features.trials.launch import DATA, compile_kernels, run_trial
 from beamline.features.trials.layout import TableLayout, event_of, write_page, write_table
 from beamline.features.trials.plans import Expected, Timed, expected_seconds, trials_left
@@ -103,13 +103,14 @@ class Planned:
         table: before any trial is done.
         layout: of the table.
         started: the event that says so.
-        reference: the trial whose volume every other trial is compared with, in addition to the truth; or None.
+        references: trials whose volumes others are compared with, in addition to the truth: each with those of its
+            method. The first one has the dense and the empty regions.
     """
 
     table: TrialTable
     layout: TableLayout
     started: Event
-    reference: Trial | None = None
+    references: tuple[Trial, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -197,8 +198,10 @@ def run_comparison(
         data.save(work / DATA)
         del data
         rig = _Rig(work, limits.seed, end, now, emit, expected)
-        if planned.reference is not None:
-            _add_reference(rig, planned.reference, truth, slices)
+        for n, reference in enumerate(planned.references):
+            volume = _add_reference(rig, reference, slices)
+            if n == 0:
+                _add_regions(rig, volume if truth is None else truth)
         if truth is not None:
             slices.add("truth", truth)
         emit(StateEntered("compiling", "Compiling kernels that are not in the cache"))
@@ -219,8 +222,8 @@ def _usable(max_seconds: float) -> float:
     return max_seconds - min(_PAGES[0], _PAGES[1] * max_seconds)
 
 
-def _add_reference(rig: _Rig, trial: Trial, truth: F32 | None, slices: SliceSheet) -> None:
-    """Make the volume that all are compared with, and its dense and empty regions, or those of the truth.
+def _add_reference(rig: _Rig, trial: Trial, slices: SliceSheet) -> F32:
+    """Make a volume that trials of its method are compared with.
 
     Raises:
         DataError: it failed.
@@ -228,14 +231,15 @@ def _add_reference(rig: _Rig, trial: Trial, truth: F32 | None, slices: SliceShee
     outcome, volume = rig.run(trial, rig.seconds, keep=True)
     if volume is None:
         raise DataError(f"{trial.title}, to compare with, failed: {outcome.message}. Nothing was written.")
-    write_array(rig.work / DATA / "reference.npy", volume)
-    try:
-        regions = metrics.kmeans_mask(metrics.sampled(volume if truth is None else truth), rig.seed)
-    except ValueError:  # without contrast
-        regions = None
-    if regions is not None:
-        write_array(rig.work / DATA / "regions.npy", regions)
-    slices.add(trial.choice.label if trial.choice else trial.title, volume)
+    write_reference(rig.work / DATA, trial.method, volume)
+    slices.add(f"{trial.choice.label if trial.choice else trial.title}: {trial.method}", volume)
+    return volume
+
+
+def _add_regions(rig: _Rig, volume: F32) -> None:
+    """The dense and the empty regions of a volume, if it has contrast."""
+    with suppress(ValueError):
+        write_regions(rig.work / DATA, metrics.kmeans_mask(metrics.sampled(volume), rig.seed))
 
 
 def until_stopped(table: TrialTable, grown: Iterable[TrialTable], write: Callable[[TrialTable], None]) -> TrialTable:

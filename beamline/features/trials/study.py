@@ -1,4 +1,4 @@
-"""Study: a scan from fewer or averaged views, by some methods, compared with the FBP of all its views."""
+"""Study: a scan from fewer or averaged views, by some methods, each compared with its volume of all views."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ from recon.base.choices import Filter
 from recon.base.method import Plain
 from recon.methods import BASELINE, by_name
 
-REFERENCE = "FBP of all views"
+REFERENCE = "all views"
 _FIGURES = {
-    "psnr_fbp": ("PSNR", "psnr"), "ssim_fbp": ("SSIM", "ssim3d"), "psnr_truth": ("PSNR truth", "psnr"),
-    "ssim_truth": ("SSIM truth", "ssim3d"), "snr": ("SNR", "snr"), "cnr": ("CNR", "cnr"),
+    "psnr_all": ("PSNR all views", "psnr"), "ssim_all": ("SSIM all views", "ssim3d"),
+    "psnr_truth": ("PSNR truth", "psnr"),
+    "ssim_truth": ("SSIM truth", "ssim3d"), "snr": ("SNR rims", "snr"), "cnr": ("CNR rims", "cnr"),
 }  # fmt: skip
 """Heading, and the metric that says how many digits it has, by name in files."""
 _MEASURED = {"psnr_truth": "psnr", "ssim_truth": "ssim3d"}  # names of metrics against the truth where trials end
@@ -49,7 +50,7 @@ class StudyOptions:
         methods: names in `recon.methods`.
         settings: of these methods, by name; methods left out have their own.
         seconds: of each row, the same for all methods; None: methods end when their work is done.
-        filter: of the FBP of all views that rows are compared with.
+        filter: of the FBP of all views.
         draws: how often random views are drawn.
     """
 
@@ -84,7 +85,7 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
     choices = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
     table = TrialTable(
         tuple(_row(choice, method, options) for choice in choices for method in options.methods),
-        "psnr_fbp",
+        "psnr_all",
         prepared.length_unit,
         machine(),
         {**opened.facts, "views to choose from": str(geometry.n_views)},
@@ -101,10 +102,16 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
         if choice.groups is None:
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
-    reference = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
+    fbp = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
+    others = (
+        Trial("method", method, geometry.n_views, settings=dict(options.settings.get(method, {})), choice=whole)
+        for method in options.methods
+        if method != BASELINE
+    )
+    references = (fbp, *(trial.in_time(options.seconds) for trial in others))
     data = TrialData(replace(prepared, held_out=None), opened.truth)
     started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
-    return data, Planned(table, layout_of(options.study), started, reference)
+    return data, Planned(table, layout_of(options.study), started, references)
 
 
 def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
@@ -115,11 +122,12 @@ def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
 
 def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
     notes = [
-        f"PSNR and SSIM are against the {REFERENCE} ({n_views}, {options.filter}): it has noise and streaks "
-        "of its own, which rows share as far as they share its views.",
+        f"PSNR and SSIM of {REFERENCE} are against the volume of {REFERENCE} ({n_views}) by the same method (fbp: "
+        f"{options.filter}): they tell what fewer views lose, not which method is better. It has noise of its own, "
+        "which rows share as far as they share its views.",
         "SNR and CNR are of the whole dense and empty region, with their rims (k-means of the "
-        + ("truth" if truth else "FBP of all views")
-        + "); a smoother volume has more.",
+        + ("truth" if truth else f"FBP of {REFERENCE}")
+        + "), unlike those of beamline recon; a smoother volume has more.",
     ]
     for method, settings in options.settings.items():
         if settings:

@@ -90,7 +90,7 @@ class StudyRequest:
 )
 @with_request(StudyRequest)
 def study(request: StudyRequest) -> None:
-    """Reconstruct the scan in FILE from chosen views, and compare each volume with the FBP of all its views.
+    """Reconstruct the scan in FILE from chosen views, and compare each volume with that of all its views.
 
     fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
     equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring

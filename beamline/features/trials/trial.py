@@ -154,8 +154,8 @@ class Outcome:
         status: only "done" comes with figures.
         seconds: wall time of the reconstruction, without compilation and measuring.
         peak_bytes: of its process; None where the system does not tell.
-        metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), and with a reference psnr_fbp,
-            ssim_fbp, snr, cnr; by name.
+        metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), and with a reference psnr_all,
+            ssim_all, snr, cnr; by name.
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of its own record of the residual.
         curve_of: which views that record is of, in words.
@@ -205,7 +205,7 @@ class Quality:
 
 QUALITIES: Mapping[str, Quality] = {
     "psnr": Quality("PSNR", "PSNR (dB)", lambda value: value),
-    "psnr_fbp": Quality("PSNR", "PSNR (dB)", lambda value: value),
+    "psnr_all": Quality("PSNR", "PSNR (dB)", lambda value: value),
     "residual_held_out": Quality(
         "−20 log₁₀ of the held-out residual",
         "held-out residual (dB below the data)",

@@ -91,7 +91,7 @@ def run(
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
-    figures, squared = measured(volume_at, data, grid, keep)
+    figures, squared = measured(trial.method, volume_at, data, grid, keep)
     if trial.halves and trial.views >= 4:
         figures["resolution"] = half_set_resolution(trial, prepared, grid, seed)
     return {
@@ -109,7 +109,7 @@ def run(
 
 
 def measured(
-    volume_at: VolumeAt, data: TrialData, grid: Grid, keep: Path | None
+    method: str, volume_at: VolumeAt, data: TrialData, grid: Grid, keep: Path | None
 ) -> tuple[dict[str, float], list[float]]:
     """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
     n, figures, squared = data.geometry.n_views, dict[str, float](), list[float]()
@@ -120,9 +120,9 @@ def measured(
         figures = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
         if data.prepared.emission is not None:
             figures |= metrics.contrast(data.truth, middle)
-    if data.reference is not None:
-        figures["psnr_fbp"] = metrics.psnr(data.reference, middle)
-        figures["ssim_fbp"] = metrics.ssim3d(data.reference, middle)
+    if (reference := data.references.get(method)) is not None:
+        figures["psnr_all"] = metrics.psnr(reference, middle)
+        figures["ssim_all"] = metrics.ssim3d(reference, middle)
     if data.regions is not None:
         figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(middle), data.regions)
     if data.prepared.held_out is not None:

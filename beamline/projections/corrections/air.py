@@ -89,9 +89,9 @@ class Air:
     @property
     def sample_from(self) -> float:
         """Line integral at the edges from which they are sample, as for the monitor; columns asked for are air."""
-        from beamline.monitor.field import FieldOfViewCheck
+        from recon.voxels.field_edges import LEAST
 
-        return FieldOfViewCheck.edge if self.model == "auto" else math.inf
+        return LEAST if self.model == "auto" else math.inf
 
     @property
     def surface(self) -> Surface:

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.storage.readers.base import WHOLE, Attributes, NotUsed, ScanSource, read_known
-from beamline.storage.readers.wrapped import WrappedSource
+from beamline.storage.readers.wrapped import UNPACKED, WrappedSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 
 _LOOKED_AT = 3  # frames of a kind
+_SATURATED = 1e-3  # of the pixels, from which light, and no gap, is at the end of a type; as the limit of flats
 _UNLIT = 0.05  # of the bright part of a flat: darker pixels tell little of the noise of light
 _PHOTONS = 0.02  # by which the variance of counted photons may differ from their mean, beside its own error
 _ERRORS = 2.5  # standard deviations of that error
@@ -46,30 +47,36 @@ class MarkedSource(WrappedSource):
 
 
 def no_data_of(source: ScanSource) -> Mask | None:
-    """bool [row, col], pixels that the file's mask, or the end of their type of 32 bits in all frames, marks.
+    """bool [row, col], pixels that the file's mask, or the end of their type in all frames, marks.
 
-    Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. A type
-    of 16 bits may end by too much light. None where nothing is marked, or more than half.
+    Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. Types
+    of 8 and 16 bits may end by too much light, so that whole rows and columns alone are marks there, and nothing else
+    may be at the end. None where nothing is marked, or more than half.
     """
     if source.dtype.kind not in "iu":
         return None
     marked = np.zeros(source.shape, np.bool_) if source.pixel_mask is None else source.pixel_mask.copy()
-    if source.dtype.itemsize >= 4:
-        marked |= _at_the_end(source)
+    if source.frame_bytes <= UNPACKED and (ends := _ends(source)):
+        in_all = np.logical_and.reduce(ends)
+        if source.dtype.itemsize < 4:
+            in_all = in_all.all(axis=0) | in_all.all(axis=1)[:, None]
+            if max(float((each & ~in_all).mean()) for each in ends) > _SATURATED:
+                in_all[:] = False
+        marked |= in_all
     return marked if 0 < marked.mean() < 0.5 else None
 
 
-def _at_the_end(source: ScanSource) -> Mask:
-    """Pixels that hold a mark in some flats and views of all the scan."""
-    marked = np.ones(source.shape, np.bool_)
+def _ends(source: ScanSource) -> list[Mask]:
+    """Where some flats and views of all the scan are at the end of their type; [] where one is nowhere."""
+    ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
         for row in np.unique(rows[np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int)]) if rows.size else ():
             image = read_known(source, [int(row)])[0]
-            marked &= image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max
-            if not marked.any():
-                return marked
-    return marked
+            ends.append(image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max)
+            if not ends[-1].any():
+                return []
+    return ends
 
 
 def counts_photons(source: ScanSource) -> bool:

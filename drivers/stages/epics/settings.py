@@ -19,7 +19,7 @@ class Search(StrEnum):
 
     @property
     def field(self) -> str:
-        """The record's field that begins it."""
+        """Field of the record that begins the search."""
         return {"none": "", "forward": ".HOMF", "reverse": ".HOMR"}[self]
 
 

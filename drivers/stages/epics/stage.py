@@ -39,7 +39,7 @@ GO, USE = "Go", "Use"
 
 @dataclass(frozen=True)
 class MotorStatus:
-    """What the record says: its place in its unit, whether it is done moving, and MSTA."""
+    """State of the record: position in its unit, whether the move is done, and MSTA."""
 
     place: float
     done: bool
@@ -47,7 +47,7 @@ class MotorStatus:
 
     @property
     def fault(self) -> tuple[str, str]:
-        """What MSTA says is wrong and what to do; empty texts without a fault."""
+        """Fault in MSTA, and advice; empty texts without a fault."""
         faults = [fault_of_bit for bit, fault_of_bit in FAULTS.items() if self.bits & bit]
         return (", ".join(text for text, _ in faults), faults[0][1]) if faults else ("", "")
 
@@ -111,7 +111,7 @@ class EpicsStage(LineStage):
         self._target, self._begun = target, self._clock.now()
 
     def start_home(self) -> None:
-        """Soft limits do not hold on the way."""
+        """Begin the search for the reference; soft limits do not apply on the way."""
         if self._settings.search is Search.NONE:
             raise DeviceRefused(
                 self.name,
@@ -175,7 +175,7 @@ class EpicsStage(LineStage):
         )
 
     def disarm(self) -> None:
-        """Nothing is ever armed."""
+        """Does nothing: the record is never armed."""
 
     def digital_output(self, number: int) -> DigitalOutput:
         raise DeviceRefused(

@@ -35,7 +35,7 @@ RATE_AGREES = Fraction(1, 100)
 
 @dataclass(frozen=True)
 class PiAxisStatus:
-    """What the axis says. `raw`: the replies, for errors."""
+    """State of the axis. raw: the replies, for errors."""
 
     counts: int
     homed: bool
@@ -59,7 +59,7 @@ class PiGcsAxis:
         """VEL, and the accelerations by the commands that set them, in degrees."""
 
     def degrees(self, counts: Fraction | int) -> str:
-        """The text for a place, distance or rate: its rounding is far below a count over any train."""
+        """Degrees as text for a position, distance or rate; rounded far below a count over any train."""
         return plain(Fraction(counts) * 360 / self._counts_per_turn)
 
     def to_counts(self, degrees: str) -> int:
@@ -99,7 +99,7 @@ class PiGcsAxis:
         return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the axes that move, as bits")[1], 16) >> self._bit & 1)
 
     def searching(self) -> bool:
-        """Whether it moves, or is between two parts of a reference move."""
+        """Whether the axis moves, or is between two parts of a reference move."""
         return self._line.ask(READY, r"\\x(b[01])", "the byte B1 (ready) or B0")[1] == "b0" or self.moving()
 
     def counts(self) -> int:
@@ -109,7 +109,7 @@ class PiGcsAxis:
         return self._line.flag("ONT?")
 
     def status(self) -> PiAxisStatus:
-        """Where it is and how; what the error register has becomes `fault`."""
+        """Read the position and state of the axis; the content of the error register becomes `fault`."""
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
@@ -117,7 +117,7 @@ class PiGcsAxis:
         return PiAxisStatus(counts, homed, servo, in_words)
 
     def limit_switch(self) -> str:
-        """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""
+        """The limit switch that is on, in words; "" without one, or for a model with an unknown register."""
         if "C-863" not in self._identity:
             return ""
         bits = int(self._line.ask(REGISTER, r"0[xX]([0-9A-Fa-f]{1,8})", "the status register")[1], 16)
@@ -151,7 +151,7 @@ class PiGcsAxis:
         return command
 
     def stop_all(self) -> str:
-        """All axes of the controller stand at once."""
+        """Stop all axes of the controller at once."""
         self._line.stop(STOP_ALL)
         return f"#{STOP_ALL[0]}"
 
@@ -220,7 +220,8 @@ class PiGcsAxis:
         own = Fraction(numerator) / Fraction(denominator) * 360
         if own == 0 or (own / self._counts_per_turn).denominator != 1:
             raise self._refused(
-                f"it counts {float(own):.10g} a turn, which is no multiple of the configured {self._counts_per_turn}",
+                f"it has {float(own):.10g} counts a turn, which is no multiple of the configured "
+                f"{self._counts_per_turn}",
                 "Correct counts_per_turn in the configuration, or the controller's parameters 0xE and 0xF",
             )
 
@@ -250,7 +251,7 @@ class PiGcsAxis:
             raise self._line.not_followed(f"{command} {self._axis} {text}", reply, text)
 
     def restore(self) -> None:
-        """Set what moves and opening have changed back, unless the axis moves: a move under way would follow."""
+        """Restore the settings that moves and opening have changed; not during a move, which would follow them."""
         if self.found.values and not self.moving():
             self._line.read_error()  # of a move or a stop before: it says nothing of the settings
             self.found.restore(lambda setting, value: self._line.set(_setting(setting, self._axis, value)))

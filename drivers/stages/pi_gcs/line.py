@@ -91,7 +91,7 @@ EVENTS = {
 
 
 def meaning(code: int) -> str:
-    """In words, with the number; "" for 0."""
+    """Meaning of an error code in words, with the number; "" for 0."""
     if code == 0:
         return ""
     words, _ = (REFUSALS | EVENTS).get(code, ("an error that this driver has no words for", ""))
@@ -171,7 +171,7 @@ class GcsLine:
         return code
 
     def judge(self, command: str, code: int) -> None:
-        """Raises the error for a code after a command."""
+        """Raise the error for a code that a command left."""
         if code:
             refused = code in REFUSALS
             raise (DeviceRefused if refused else DeviceError)(
@@ -189,15 +189,16 @@ class GcsLine:
         return self._serial.query(request, form, meant, self._state())
 
     def flag(self, query: str) -> bool:
-        """A query of the axis that is answered by 0 or 1."""
+        """Ask the axis a query whose answer is 0 or 1."""
         return self.ask(f"{query} {self._axis}", self._key + "([01])", f"{self._axis}=0 or {self._axis}=1")[1] == "1"
 
     def number(self, query: str, form: str = NUMBER) -> str:
-        """A query of the axis that is answered by a number, as it is written."""
+        """Ask the axis a query whose answer is a number, and return it as written."""
         return self.ask(f"{query} {self._axis}", self._key + form, f"{self._axis}=number")[1]
 
     def parameter(self, number: str) -> str | None:
-        """SPA?; None for an unknown parameter: the controller then does not answer, and sets the error register."""
+        """Read a parameter (SPA?); None if it is unknown: the controller then sets the error register and does not
+        answer."""
         request = f"SPA? {self._axis} {number}"
         try:
             return self.ask(request, rf"{re.escape(self._axis)} \w+ ?= ?{NUMBER}", f"{self._axis} {number}=number")[1]
@@ -225,7 +226,7 @@ class GcsLine:
         self._serial.send("")
 
     def close(self) -> None:
-        """Free the port; a second time does nothing."""
+        """Close the port; calling again does nothing."""
         self._serial.close()
 
     def _state(self) -> str:

@@ -59,7 +59,7 @@ class PiGcsSettings:
         if self.wiring.pulse_width is not None:
             raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
         if not re.fullmatch(AXIS_NAME, self.axis):
-            raise ValueError(f"an axis cannot be called {self.axis!r}; its name has 1 to 16 letters, digits and _")
+            raise ValueError(f"axis {self.axis!r} is not a legal name; expected 1 to 16 letters, digits and _")
         self.limits()
 
     @property

@@ -21,7 +21,7 @@ the rounded step cannot be seen; a smaller error spoils no image.
 
 
 class PiFirstPulse(StrEnum):
-    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+    """Place of a train's first pulse, which the firmware decides. To find out: arm 3 pulses, pass them, and count."""
 
     AT_THRESHOLD = "at_threshold"
     """At the start threshold: it is put on the first pulse."""
@@ -57,7 +57,7 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
-            f"this controller gives pulses at whole multiples of {step} counts only, which {train.start} is not"
+            f"this controller gives pulses only at whole multiples of {step} counts, and {train.start} is none"
         )
     before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))

@@ -27,7 +27,7 @@ STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
 @dataclass(frozen=True)
 class ChannelStatus:
-    """Reply to STSx?. `ending` is why the last move ended early, in words; "" if it did not."""
+    """Reply to STSx?. ending: why the last move ended early, in words; "" if it did not."""
 
     remote: bool
     moving: bool
@@ -137,7 +137,7 @@ class PM16CChannel:
         self._begin(f"GTHP{self._digit}", home)
 
     def home(self) -> int | None:
-        """Where the home switch was found, in counts; None if no search has found it."""
+        """Position of the home switch in counts; None if no search has found it."""
         reply = self._line.ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
         return None if reply[1] is None else int(reply[1])
 
@@ -257,7 +257,7 @@ class HomeSearch:
         self._cancelled = True
 
     def go_on(self, status: ChannelStatus) -> bool:
-        """Take the next step after the motor has come to rest. False if there is no further step.
+        """Take the next step after the motor has come to rest; False if there is none.
 
         Raises:
             DeviceError: the search ended without the switch, or was stopped.

@@ -26,7 +26,7 @@ def steepest_code(acceleration: float) -> int:
     """
     codes = [code for code, ms in enumerate(RATES) if 1e6 / ms <= acceleration * (1 + 1e-9)]
     if not codes:
-        raise ValueError(f"{acceleration:g} pulses/s² is gentler than the controller's gentlest, {1e6 / RATES[0]:g}")
+        raise ValueError(f"{acceleration:g} pulses/s² is below the controller's least acceleration, {1e6 / RATES[0]:g}")
     return codes[-1]
 
 
@@ -53,7 +53,7 @@ class PM16CSettings:
 
     def __post_init__(self) -> None:
         if not 0 <= self.channel <= 15:
-            raise ValueError(f"there is no channel {self.channel}; there are 0 to 15")
+            raise ValueError(f"channel {self.channel} does not exist; expected 0 to 15")
         if not self.wiring.active_high:
             raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
         if self.home is not None and not abs(self.home) * self.figures.per_radian <= MAX_COUNT:
@@ -64,17 +64,17 @@ class PM16CSettings:
 
     @property
     def widths(self) -> PulseWidths:
-        """The pulse widths that a train may take."""
+        """Pulse widths that a train may use."""
         return PulseWidths(self.wiring.pulse_width)
 
     @property
     def fastest(self) -> int:
-        """pulses/s."""
+        """Full speed in pulses/s."""
         return round(self.figures.max_speed * self.figures.counts_per_turn / (2 * math.pi))
 
     @property
     def search_rate(self) -> int:
-        """pulses/s of the search for the home switch."""
+        """Speed of the search for the home switch in pulses/s."""
         most, speed = 2 * self.figures.max_speed, self.home_speed
         speed = self.figures.max_speed / 10 if speed is None else speed
         return round(speed * self.figures.counts_per_turn / (2 * math.pi)) if 0 < speed < most else 0

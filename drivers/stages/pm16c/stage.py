@@ -64,7 +64,7 @@ class PM16CStage(LineStage):
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """`wait` does the later steps of the search. An armed train is disarmed."""
+        """Begin the search for home; `wait` does its later steps. An armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,

@@ -34,7 +34,7 @@ class PulseWidths:
 
     @property
     def spacing(self) -> float:
-        """Least s between pulses. Closer pulses would merge: the controller then leaves the output high."""
+        """Least time between pulses in s. Closer ones would merge, and the controller then leaves the output high."""
         return 2 * self.allowed[-1]
 
     def widest_for(self, train: TriggerTrain, limits: StageLimits) -> float:
@@ -44,7 +44,7 @@ class PulseWidths:
 
 
 class Pm16cFirstPulse(StrEnum):
-    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+    """Place of a train's first pulse, which the firmware decides. To find out: arm 3 pulses, pass them, and count."""
 
     AT_START = "at_start"
     """The start point itself fires."""
@@ -54,7 +54,7 @@ class Pm16cFirstPulse(StrEnum):
 
 @dataclass(frozen=True)
 class TriggerPoints:
-    """In counts, as TMGS, TMGE and TMGI take them."""
+    """Trigger points in counts, as arguments of TMGS, TMGE and TMGI."""
 
     start: int
     end: int

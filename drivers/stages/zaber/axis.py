@@ -121,7 +121,7 @@ class ZaberAxis:
         return self._get_if_known("limit.cycle.dist", axis=True)
 
     def travel(self) -> tuple[int, int]:
-        """The device's own limits in microsteps."""
+        """Limits of the device itself in microsteps."""
         low, high = (int(self.get(f"limit.{end}", WHOLE)) for end in ("min", "max"))
         return low, high
 

@@ -113,7 +113,7 @@ def encode(device: int, axis: int, identity: int, words: str) -> str:
 
 
 def damage(line: str, *, must_have_checksum: bool) -> str:
-    """The fault of a received line by its checksum, "" if it is good.
+    """Fault of a received line by its checksum; "" if it is good.
 
     Only replies, alerts and information carry a checksum; other lines pass.
     """
@@ -136,8 +136,8 @@ def reply_form(device: int, axis: int, identity: int, data: str) -> str:
 
 
 def passed_over_form(identity: int) -> str:
-    """Regular expression of lines that no command waits for: alerts, information, echoes, empty lines, and replies to
-    commands with this id.
+    """Regular expression of lines to skip: alerts, information, echoes, empty lines, and replies to commands with this
+    id.
     """
     return rf"|[!#/].*|@\d\d \d {identity:02d} .*"
 

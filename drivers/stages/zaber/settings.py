@@ -39,7 +39,9 @@ class ZaberSettings:
 
     def __post_init__(self) -> None:
         if not (1 <= self.device <= 99 and 1 <= self.axis <= 9):
-            raise ValueError(f"device {self.device}, axis {self.axis} do not exist; they are 1 to 99 and 1 to 9")
+            raise ValueError(
+                f"device {self.device}, axis {self.axis} cannot exist; expected device 1 to 99 and axis 1 to 9"
+            )
         self.limits()
 
     @property

@@ -27,7 +27,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.vectors import dot
 from recon.prep.background import LEAST_SIZE, coordinate, powers
-from recon.splatting.initialise import leaves_the_field
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
@@ -169,10 +169,11 @@ class _Views:
             whole = bin_views(measured[None].astype(np.float32), factor) > 1 - 1e-6
             weight = np.broadcast_to(whole, data.shape).astype(np.float32)
         grid = Grid.matching(views)
-        if leaves_the_field(data, views):
+        if wider_than_field(data, views):
             grid = Grid.for_fit(views, grid, wider=True)
         terms = np.array([[_surface(one, time, shape, factor) for time in times[some]] for one in np.eye(len(TERMS))])
-        return cls(data, terms, weight, Projector(views, grid), times[some])
+        # A background is smooth: thresholds on what views held out gain were found without sharpening.
+        return cls(data, terms, weight, Projector(views, grid).plain, times[some])
 
     def select(self, numbers: NDArray[np.intp]) -> _Views:
         weight = None if self.weight is None else self.weight[numbers]

@@ -28,10 +28,9 @@ _FIRST = 0.1  # the first weight, over the largest gradient at zero
 ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
-FIRST_HEAVIER = 3  # likewise, then of a heavier one for the first component
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
 MATERIAL_SWEEPS = 20
-TRIAL_SWEEPS = (_TRIALS + _HEAVIER + FIRST_HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +188,8 @@ def weights_by_views(
 ) -> F64:
     """Weights of total variation [component], by one view in eight held out.
 
-    First one weight for all components, halved until it predicts worse. Each component then gets the heaviest that
-    predicts within 1 % of the best. Those that hold differences come first: they have less structure, and the same
-    noise. What energies have in common comes last.
+    First one weight for all components, halved until it predicts worse. Those that hold differences then get the
+    heaviest that predicts within 1 % of the best: they have less structure, and the same noise.
 
     Args:
         alike: all components keep one weight.
@@ -206,12 +204,9 @@ def weights_by_views(
         for chosen in (~held_out, held_out)
     )
     trials = _Trials(fit, judge, (ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS, go_on, stop)
-    of_first = 0 if alike else FIRST_HEAVIER
-    weights = trials.common(after=_HEAVIER + of_first)
+    weights = trials.common(after=_HEAVIER)
     components = np.arange(len(weights))
     if trials.going:
         factor = np.where((components > 0) | alike, 2.0, 1.0)
-        weights = trials.heaviest(weights, factor, _HEAVIER, after=of_first)
-    if trials.going and not alike:
-        weights = trials.heaviest(weights, np.where(components == 0, 2.0, 1.0), FIRST_HEAVIER, after=0)
+        weights = trials.heaviest(weights, factor, _HEAVIER, after=0)
     return weights

@@ -23,9 +23,10 @@ from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
 from recon.features.neural.networks import Field
 from recon.features.neural.rays import Places, drawn, rays_of
-from recon.splatting.initialise import density_unit, first_volume, leaves_the_field
+from recon.splatting.initialise import density_unit, first_volume
 from recon.splatting.train import used_and_kept_back
 from recon.voxels.direct import direct_work
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.voxel_problem import iterative_memory
 
 CHUNK = 2**15  # Samples that one pass through the network takes
@@ -166,7 +167,7 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
-    grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
+    grid = Grid.for_fit(geometry, problem.grid, wider=wider_than_field(data[used], seen))
     unit = density_unit(first_volume(data[used], seen, grid))
     if unit <= 0 or not (data[used] > 0).any():
         raise ValueError("the views hold no matter: nothing absorbs. A field needs views of a sample")

@@ -92,7 +92,7 @@ def _made_up(trial: Trial, *_: object, keep: Path | None = None, **__: object) -
     amount = float(trial.views / trial.binning)
     if keep is not None:
         write_array(keep, np.linspace(0, amount, 3200, dtype=np.float32).reshape(2, 40, 40))
-    found = {"residual_held_out": 1 / amount, "psnr_fbp": amount, "ssim_fbp": 0.5}
+    found = {"residual_held_out": 1 / amount, "psnr_all": amount, "ssim_all": 0.5}
     return Outcome(trial, "done", amount / 1000, int(1e6 * amount), found, cpu_seconds=amount / 1000)
 
 

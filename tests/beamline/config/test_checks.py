@@ -25,8 +25,8 @@ from tests.beamline.config_file import GOOD, faults, load, write
             "simulation: {}\nrecon: {axis: 8.5}",
             r"my\.yaml:\d+: recon\.axis 8\.5 .* columns 0 \.\.\. 7",
         ),
-        ("simulation: {}", "simulation: &a {scene: {x: *a}}", "holds itself"),
-        ("simulation: {}", "simulation: " + 3000 * "[", "nested beyond reason"),
+        ("simulation: {}", "simulation: &a {scene: {x: *a}}", "contains itself"),
+        ("simulation: {}", "simulation: " + 3000 * "[", "nested too deeply"),
     ],
 )
 def test_what_no_type_can_say_has_its_line_too(tmp_path: Path, old: str, new: str, said: str) -> None:
@@ -46,7 +46,7 @@ def test_a_shutter_does_not_share_the_trigger_output(tmp_path: Path, stage: str,
     assert text != GOOD
     with_shutter = "devices.shutter={kind: stage_output, output: %d}"
     assert load(write(tmp_path, text), with_shutter % (taken + 1)).devices.shutter.kind == "stage_output"
-    assert f"shutter.output {taken} is the output" in faults(tmp_path, text, with_shutter % taken)
+    assert f"shutter.output {taken} carries the trigger pulses" in faults(tmp_path, text, with_shutter % taken)
 
 
 @pytest.mark.parametrize("option", ["trigger_mode=start", "trigger_active=sync_readout", "trigger_times=2"])

@@ -65,7 +65,7 @@ FAULTS = {
     ),
     "mixed": (
         ('"sim://pm16c"', "COM3"),
-        "my.yaml:7: devices.stage: simulated devices cannot see real ones: camera, "
+        "my.yaml:7: devices.stage: simulated and real devices cannot be mixed: camera, "
         "shutter, sample_mover simulated, stage real",
     ),
     "stage of no kind": (
@@ -87,7 +87,7 @@ FAULTS = {
     ),
     "an electrometer that sees no simulated beam": (
         ("  shutter:", "  beam_monitor: {kind: electrometer, port: COM4}\n  shutter:"),
-        "simulated devices cannot see real ones: stage, camera, shutter, sample_mover simulated, beam_monitor real",
+        "simulated and real devices cannot be mixed: stage, camera, shutter, sample_mover simulated, beam_monitor real",
     ),
     "a pattern that finds nothing": (
         ("  shutter:", "  beam_monitor: {kind: ring_current, url: 'http://ring/', pattern: mA}\n  shutter:"),
@@ -141,8 +141,8 @@ _BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("9" * 5000, "a number has 5000 digits"),
         ("0x" + "f" * 5000, "a number has 5002 digits"),
         ("1e400", "scan.exposure_s is"),
-        ("&a [*a]", "holds itself"),
-        ("[" * 3000, "nested beyond reason"),
+        ("&a [*a]", "contains itself"),
+        ("[" * 3000, "nested too deeply"),
         ("!!python/name:os.system", "could not determine a constructor"),
     ],
 )
@@ -219,7 +219,7 @@ def test_a_number_beyond_all_that_is_real_is_refused(tmp_path: Path, setting: st
         ("[]", "devices.filter.places is []; expected a list of 1 or more: text of 1 to 80 characters"),
         ("['']", "devices.filter.places.0 is ''; expected text of 1 to 80 characters"),
         ("[3]", "devices.filter.places.0 is 3; expected text of 1 to 80 characters"),
-        ("[Al, Cu, Al]", "places has Al more than once; a place has one name"),
+        ("[Al, Cu, Al]", "places lists Al more than once; each place needs its own name"),
     ],
 )
 def test_a_list_of_names_says_what_it_expects(tmp_path: Path, places: str, said: str) -> None:

@@ -171,7 +171,7 @@ def test_a_real_device_among_simulated_ones_is_named_with_its_line(tmp_path: Pat
     for name in set(tree["devices"]["camera"]) - set(simulated):
         text = path.read_text("utf-8").splitlines(keepends=True)
         path.write_text("".join(line for line in text if not line.strip().startswith(f"{name}:")), "utf-8")
-    with pytest.raises(ConfigError, match="see real ones") as refused:
+    with pytest.raises(ConfigError, match="cannot be mixed") as refused:
         load(path, environment={})
     assert str(refused.value).startswith(f"{path}:{_line(path, key)}: ")
 

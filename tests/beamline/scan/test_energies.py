@@ -195,8 +195,8 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("scan.energies=[8.3, 8.3]",), "has an energy twice"),
-        (("scan.energies=[8.3, 8.30000000001]",), "has an energy twice, to seven digits"),
+        (("scan.energies=[8.3, 8.3]",), "lists 8.3 keV twice"),
+        (("scan.energies=[8.3, 8.30000000001]",), "keV twice, to seven digits"),
         (("scan.energy=8.3",), "exclude each other"),
         (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),
@@ -205,7 +205,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         (("simulation.scene.phantom.materials.fresh.formula=Xx",), "Xx"),
         (("scan.energies=[8.3, 9000]",), "9000"),
         (("scan.energies=[.nan]",), "scan.energies.0 is .nan"),
-        (("devices.monochromator={kind: simulated, range_kev: [25, 4]}",), "expected the lower energy first"),
+        (("devices.monochromator={kind: simulated, range_kev: [25, 4]}",), "give the lower energy first"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, words: tuple[str, ...], said: str) -> None:

@@ -90,9 +90,12 @@ def test_a_motor_brings_it_there_for_a_scan_and_for_tune(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((KIND, "scan.filter=Cu"), r"scan\.filter 'Cu' is no place of the filter; devices\.filter has none, Al 1 mm"),
-        (("scan.filter=Cu",), r"scan\.filter 'Cu' is no place of the filter; devices\.filter has none"),
-        (("devices.filter={kind: epics, pv: 'pva://f', places: {a: 1, b: 1}}",), "places: two have one value"),
+        (
+            (KIND, "scan.filter=Cu"),
+            r"scan\.filter 'Cu' is not one of the filter's places; devices\.filter has none, Al 1 mm",
+        ),
+        (("scan.filter=Cu",), r"scan\.filter 'Cu' is not one of the filter's places; devices\.filter has none"),
+        (("devices.filter={kind: epics, pv: 'pva://f', places: {a: 1, b: 1}}",), "two places have the same value"),
         (("devices.filter={kind: epics, pv: 'pva://f', places: {a: 1}}",), r"simulated.*filter real"),
         (
             (f"devices.filter={{kind: stage, places: {{a: 999}}, stage: {MOTOR}}}",),

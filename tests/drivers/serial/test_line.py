@@ -316,5 +316,5 @@ def test_a_port_that_takes_no_bytes_is_a_timeout() -> None:
         def receive(self, data: bytes) -> None:
             raise serial.SerialTimeoutException("write timeout")
 
-    with pytest.raises(DeviceTimeout, match=r"took no bytes.*'GO'\..*may still be"):
+    with pytest.raises(DeviceTimeout, match=r"accepted no bytes.*'GO'\..*may still be"):
         connect(Stuck()).send("GO")

@@ -26,7 +26,9 @@ def textured() -> F32:
     grid = Grid.matching(VIEWS)
     _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
     grains = gaussian_filter(rng.normal(size=grid.shape), 1.2) > 0
-    return Projector(VIEWS, grid).forward(np.where(np.hypot(x, y) < 40, 0.01 + 0.03 * grains, 0).astype(np.float32))
+    return Projector(VIEWS, grid).plain.forward(
+        np.where(np.hypot(x, y) < 40, 0.01 + 0.03 * grains, 0).astype(np.float32)
+    )
 
 
 def _noise(views: F32, sigma: float, blur: float = 0.0) -> F32:

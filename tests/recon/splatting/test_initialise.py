@@ -10,7 +10,6 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     first_volume,
-    leaves_the_field,
     mean_change,
     morton_order,
     place,
@@ -18,6 +17,7 @@ from recon.splatting.initialise import (
     scale_to_data,
 )
 from recon.splatting.splat import project
+from recon.voxels.field_edges import wider_than_field
 from recon.voxels.projector import Projector
 from tests.recon.conftest import Make
 
@@ -56,13 +56,13 @@ def test_a_sample_wider_than_the_field_is_noticed(half: float, leaves: bool) -> 
     views = Geometry.parallel(angles, (3, 24))
     u = np.arange(24) - 11.5
     chords = 2 * np.sqrt(np.maximum(half**2 - u**2, 0)).astype(np.float32)
-    assert leaves_the_field(np.broadcast_to(chords, (8, 3, 24)), views) == leaves
+    assert wider_than_field(np.broadcast_to(chords, (8, 3, 24)), views) == leaves
 
 
 def test_the_edge_near_an_axis_off_the_middle_does_not_count() -> None:
     views = Geometry.parallel(np.linspace(0, 2 * np.pi, 8, endpoint=False), (3, 24), axis_col=4.0)
     chords = 2 * np.sqrt(np.maximum(15.0**2 - (np.arange(24) - 4.0) ** 2, 0)).astype(np.float32)
-    assert chords[0] > 0 and not leaves_the_field(np.broadcast_to(chords, (8, 3, 24)), views)
+    assert chords[0] > 0 and not wider_than_field(np.broadcast_to(chords, (8, 3, 24)), views)
 
 
 def test_a_sample_wider_than_the_field_gets_gaussians_up_to_the_corners(rng: np.random.Generator) -> None:

@@ -31,4 +31,4 @@ def test_values_survive_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.prepared.held_out[0], images[3:])
     np.testing.assert_array_equal(back.truth, images)
     np.testing.assert_array_equal(back.shown_held_out, np.arange(6.0))
-    assert back.reference is None and isinstance(back.prepared.projections.data, np.memmap)
+    assert back.references == {} and isinstance(back.prepared.projections.data, np.memmap)

@@ -44,8 +44,11 @@ def _scan(
 
 @pytest.mark.parametrize(
     ("dtype", "mark", "stated"),
-    [("u4", 2**32 - 1, False), ("u4", 2**32 - 1, True), ("u2", 65535, True), ("i4", -1, False), ("u2", 123, True)],
-)
+    [
+        ("u4", 2**32 - 1, False), ("u4", 2**32 - 1, True), ("u2", 65535, True), ("u2", 65535, False), ("i4", -1, False),
+        ("u2", 123, True),
+    ],
+)  # fmt: skip
 def test_marked_pixels_hold_no_counts_and_a_counter_needs_no_darks(
     tmp_path: Path, rng: np.random.Generator, dtype: str, mark: int, stated: bool
 ) -> None:
@@ -67,7 +70,6 @@ def test_marked_pixels_hold_no_counts_and_a_counter_needs_no_darks(
         (2.0, 0, "u4", 2**32 - 1),
         (1.0, 100, "u4", 2**32 - 1),
         (1.0, 0, "u2", None),  # nothing is marked: any camera
-        (1.0, 0, "u2", 65535),  # may be too much light
     ],
 )
 def test_cameras_need_darks(
@@ -75,6 +77,19 @@ def test_cameras_need_darks(
 ) -> None:
     with open_scan(_scan(tmp_path / "s.nx", rng, dtype, mark, None, gain, offset)) as source:
         assert [f.message for f in scan_findings(source) if "Counts without darks" in f.message]
+
+
+@pytest.mark.parametrize("where", [np.s_[:, :, 5:20], np.s_[:, 4:9, 5:20], np.s_[:5]])
+def test_too_much_light_is_no_mark(tmp_path: Path, rng: np.random.Generator, where: tuple[slice, ...]) -> None:
+    """Air that is saturated in flats and views, as whole columns, too: more of such flats is than of views."""
+    path = _scan(tmp_path / "s.nx", rng, "u2")
+    with h5py.File(path, "r+") as file:
+        frames = file["entry/instrument/detector/data"][()]
+        frames[:FLATS, :, 4:30] = 65535
+        frames[where] = 65535
+        file["entry/instrument/detector/data"][...] = frames
+    with open_scan(path) as source:
+        np.testing.assert_array_equal(source.read(slice(None)), frames)
 
 
 def test_a_mask_is_mirrored_with_its_frames(tmp_path: Path, rng: np.random.Generator) -> None:

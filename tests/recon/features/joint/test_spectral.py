@@ -11,7 +11,6 @@ import pytest
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.joint import spectral
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.spectral import TRIAL_SWEEPS, fit_materials
 from recon.methods import by_name
@@ -161,17 +160,9 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert [sweep for sweep, _ in heard if sweep > 0] == [1, 2, 3]
 
 
-def test_what_energies_have_in_common_gets_the_heaviest_weight_that_predicts_as_well(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    truth, views = balls(), views_of(balls(), 8, noise=0.05)
-    heavier = fit_materials(views)
-    monkeypatch.setattr(spectral, "FIRST_HEAVIER", 1)
-    lighter = fit_materials(views)
-    assert heavier.weights[0] in (2 * lighter.weights[0], 4 * lighter.weights[0])
-    assert heavier.weights[1] == lighter.weights[1]
-    sums = [rms((found.densities - truth).sum(0)) for found in (heavier, lighter)]
-    assert sums[0] < 0.95 * sums[1]
+def test_what_differs_between_energies_gets_a_weight_as_heavy_or_heavier() -> None:
+    first, *others = fit_materials(views_of(balls(), 8, noise=0.05)).weights
+    assert others and all(math.log2(each / first) in range(5) for each in others)
 
 
 def test_each_sweep_of_a_trial_of_weights_may_end_the_fit() -> None:

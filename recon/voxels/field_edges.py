@@ -1,0 +1,72 @@
+"""Field edges: whether a sample goes on beyond the edges of the field, which every reader of the views asks here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.empirical import EMPTY
+from recon.base.geometry import Geometry
+from recon.voxels.view_weights import covers_the_circle
+
+LEAST = 0.1
+"""Line integral at an edge above which matter is there: more than phase fringes, scatter and a drift of air leave."""
+
+_VIEWS, _PARTS, _FULL = 32, 4, 0.5  # views looked at, parts of them; share of the fullest row's mass that a row needs
+
+
+@dataclass(frozen=True)
+class FieldEdges:
+    """The edges of parallel views or of a cone.
+
+    Attributes:
+        levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
+        mean: of the views.
+    """
+
+    levels: Mapping[str, float]
+    mean: float
+
+    @classmethod
+    def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
+        """By up to 32 views, in the rows that hold matter.
+
+        Medians over views and rows: corners at some angles do not count. The least of the quarters: a beam drifts away
+        from its flats, a sample is there from the first to the last view. A full turn about an axis off the middle is
+        cut near the axis on purpose; the other half turn sees what is there.
+
+        Args:
+            data: line integrals [view, row, col].
+        """
+        n, cols = len(data), data.shape[2]
+        width = max(2, cols // 50)
+        if n == 0 or cols < 2 * width:
+            return cls({}, 0.0)
+        some = data[np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))]
+        mass = np.maximum(some.mean(axis=(0, 2)), 0)
+        some = some[:, mass >= _FULL * mass.max()]
+        edges = {"left": some[..., :width], "right": some[..., -width:]}
+        if geometry.is_off_middle and covers_the_circle(geometry.angles):
+            far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
+            edges = {far: edges[far]}
+        levels = {
+            side: min(float(np.median(part)) for part in np.array_split(values, min(_PARTS, len(values))))
+            for side, values in edges.items()
+        }
+        return cls(levels, float(np.median(some.mean(axis=(1, 2)))))
+
+    def beyond(self, least: float = LEAST) -> dict[str, float]:
+        """The edges beyond which the sample goes on, with their line integrals; empty where it is in the field.
+
+        Args:
+            least: line integral that a beam which changes may leave; 0 of views whose air is at zero.
+        """
+        return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
+
+
+def wider_than_field(projections: F32, geometry: Geometry) -> bool:
+    """Whether the sample is wider than the field, for views [view, row, col] whose air is at zero."""
+    return bool(FieldEdges.of(projections, geometry).beyond(0.0))

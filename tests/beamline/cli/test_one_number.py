@@ -1,0 +1,129 @@
+"""One name, one number: a figure is the same wherever it is shown."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import recon
+from beamline.core.events import StateEntered, Warned
+from beamline.core.sinks import Note, Warnings
+from beamline.projections.prepare import prepare_projections, report_defects
+from beamline.projections.selection import Selection
+from beamline.reconstruct.measure import measure
+from beamline.report.metrics import METRICS
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.voxels.direct import direct
+from recon.voxels.projector import Projector
+from recon.voxels.resolution import Resolution
+from tests.beamline.array_source import ArraySource
+from tests.beamline.cli.small_scan import SCAN, beamline
+from tests.beamline.scans import write_exchange
+from tests.clock import SteppedClock
+
+SWEEP = "beamline.features.sweeps.sweep"
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path) -> None:
+    """The same volume and the same views: one figure, and one label."""
+    sweep, data_of = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.data")
+    worker = pytest.importorskip("beamline.features.trials.worker")
+    source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
+    source.quantity = "line_integrals"
+    prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)  # type: ignore[arg-type]
+    prepared = replace(prepared, view_weights=None)
+    grid = Grid.matching(prepared.geometry)
+    volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
+    by_recon = measure(volume, prepared, None)["residual_held_out"]
+    assert prepared.held_out is not None and prepared.held_out_ids is not None
+    data, unseen = prepared.held_out
+    projector = Projector(unseen, grid)
+    views = sweep.HeldOutViews(prepared.held_out_ids, data, prepared)
+    one = sweep.SweptSlice({"a": "1"}, volume.data[0], 0.0, views, projector.forward(volume.data), projector.resolution)
+    scores = sweep.scores_of([one])
+    assert scores is not None
+    by_tradeoff, _ = worker.measured("fbp", lambda _: volume.data, data_of.TrialData(prepared, None), grid, None)
+    assert scores.shares[0] == pytest.approx(by_recon, rel=1e-5)
+    assert by_tradeoff["residual_held_out"] == pytest.approx(by_recon, rel=1e-5)
+    swept = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7")
+    assert METRICS["residual_held_out"].label in swept.stdout
+
+
+def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
+    shown = beamline("recon", "scan.h5", "-m", "cgls", "--axis", "20.7", "-o", "shown.h5")
+    assert shown.exit_code == 0, shown.output
+    page = re.sub(r"<[^>]*>|\s+", " ", (folder / "shown.html").read_text(encoding="utf-8"))
+    for label in ("Time of reconstruction", "Time of the whole command"):
+        on_page, on_terminal = (
+            sorted(re.findall(r"([\d.]+) s\b", found[1]))
+            for text in (page, shown.output)
+            if (found := re.search(rf"{label} ((?: *[\d.]+ s| *–)+)", text))
+        )
+        assert on_page == on_terminal
+    told = beamline("recon", "scan.h5", "-m", "cgls", "--axis", "20.7", "-o", "told.h5", "--json")
+    done = json.loads(told.stdout.splitlines()[-1])
+    page = re.sub(r"<[^>]*>|\s+", " ", (folder / "told.html").read_text(encoding="utf-8"))
+    assert re.search(rf"Time of the whole command {done['elapsed']:.1f} s", page)
+
+
+@pytest.mark.feature
+@pytest.mark.slow
+def test_a_study_names_what_its_figures_are_of(folder: Path) -> None:
+    """Rows are compared with the volume of all views by their own method; contrast with rims has another name."""
+    write_exchange(folder / "many.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 2.0))))
+    result = beamline("study", "fixed-views", "many.h5", "--axis", "20.7", "-m", "fbp", "-m", "cgls", "-o", "study")
+    assert result.exit_code == 0, result.output
+    with (folder / "study" / "study.csv").open(encoding="utf-8", newline="") as file:
+        assert {"psnr_all", "ssim_all"} <= set(next(csv.DictReader(file)))
+    assert "by the same method" in result.stdout
+
+
+def test_python_says_it_in_a_line_and_warns() -> None:
+    views = SCAN.line_integrals().astype(np.float32)
+    found = recon.find_axis(views, SCAN.angles)
+    assert str(found).startswith(f"column {found.value:.2f} by ") and "\n" not in str(found)
+    geometry = Geometry.parallel(SCAN.angles, views.shape[1:], axis_col=20.7)
+    views[0, 0, 0] = np.nan
+    with pytest.warns(UserWarning, match="1 of .* values of the projections are not finite"):
+        recon.reconstruct(views, geometry, "fbp")
+    assert Geometry.cone.__doc__ is not None and "in the plane of the detector" in Geometry.cone.__doc__
+
+
+def test_what_was_done_is_a_note_and_what_may_be_wrong_a_warning() -> None:
+    events: list[object] = []
+    warn = Warnings(events.append, SteppedClock(0.0))
+    warn("something may be wrong")
+    warn(Note("something was done"))
+    assert [type(event) for event in events] == [Warned, StateEntered]
+    projections = recon.correct(
+        np.full((4, 8, 8), 90.0), np.arange(4.0), recon.References(np.zeros((8, 8)), ((0.0, np.full((8, 8), 100.0)),))
+    )
+    told: list[str] = []
+    masked = np.zeros((8, 8), bool)
+    masked[3, 3] = True
+    report_defects(replace(projections, masked=masked, floored=0.5), told.append)
+    assert [isinstance(sentence, Note) for sentence in told] == [True, False]
+
+
+def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
+    sweep = pytest.importorskip(SWEEP)
+    views = sweep.HeldOutViews(np.arange(4), np.ones((4, 2, 8), np.float32), None)  # type: ignore[arg-type]
+    image, views_at = np.zeros((8, 8), np.float32), Geometry.parallel(np.arange(4.0), (2, 8))
+    even = Resolution.of(views_at, Grid.matching(views_at))
+
+    def leaving(share: float) -> object:
+        return sweep.SweptSlice(
+            {"axis": str(share)}, image, 0.0, views, np.full((4, 2, 8), 1 + share, np.float32), even
+        )
+
+    flat, clear = (sweep.scores_of([leaving(0.1), leaving(worse)], direct=True) for worse in (0.103, 0.12))
+    assert flat is not None and flat.best is None and not any(flat.alike)
+    assert clear is not None and clear.best == 0

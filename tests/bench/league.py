@@ -1,0 +1,195 @@
+"""A league: our methods and every peer that is installed, on the same scans, by default and by the best setting.
+
+python -m tests.bench.league SCORES.json [--scans "bone;Diamond"] [--of svmbir] [--small] > table.md
+adds scores to the file, and prints the table of all that are in it. pip install ".[league]" brings the peers that need
+no compiler. ASTRA (GPL) and mbirjax (JAX) take part where they are installed.
+
+50 views of 10⁵ photons by exact strip integrals through voxels half as wide (a cone: four rays a pixel, through voxels
+a quarter as wide), and Diamond's scan. 129 columns, so that the axis lies on the middle of a pixel, which scikit-image
+takes for granted. PSNR in dB inside the cylinder that all views see, values clipped at 0; of Diamond -20 log10 of the
+RMS that is left of views never seen, by strip integrals through the volume, which are no method's own. The best setting
+is best by these, which no user knows. Two threads; each competitor has a process of its own, whose peak memory counts
+with all that it imports. CPU seconds of the volume alone; what compiles did so before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import pickle
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from tests.bench import quality_cases
+from tests.bench.league_peers import LEAGUE
+from tests.bench.quality_cases import Case, cone, diamond, seen_by_simulator, slab, strip_integrals
+from tests.bench.test_patch_prior import TEXTURED
+
+F32 = NDArray[np.float32]
+VIEWS, PHOTONS, THREADS = 50, 1e5, 2
+SLICES = 2  # that a competitor makes who treats them alone
+DATA = Path("../shared/data")
+
+
+class Score(NamedTuple):
+    """`setting` by its quality in dB, CPU seconds and peak memory of the process in MB."""
+
+    setting: str
+    quality: float
+    seconds: float
+    memory: float
+
+
+def _odd(name: str) -> Callable[[Path], Case]:
+    """`slab` of one column and row more."""
+
+    def load(folder: Path) -> Case:
+        fine = {**quality_cases.SLABS, **TEXTURED}[name]
+        quality_cases.SLABS["odd"] = lambda where: np.pad(fine(where), ((0, 0), (0, 2), (0, 2)))
+        return slab(folder, "odd", VIEWS, PHOTONS)
+
+    return load
+
+
+SCANS: dict[str, Callable[[Path], Case]] = {
+    "bone": _odd("bone"),
+    "cement": _odd("cement"),
+    "thorax": _odd("thorax"),
+    "bone, fine structure": _odd("bone, binned"),
+    "cement, fine structure": _odd("cement, binned"),
+    "teapot, cone": lambda folder: cone(folder, "teapot", VIEWS, 64, seen_by_simulator),
+    "Diamond": lambda folder: diamond(folder, 76),
+}
+
+
+def smaller(case: Case, rows: int = 4) -> Case:
+    """The middle rows alone, for a test; a cone as it is."""
+    geometry = case.geometry
+    if geometry.is_cone:
+        return case
+    first = (geometry.detector_shape[0] - rows) // 2
+    return rows_of(case, range(first, first + rows))
+
+
+def rows_of(case: Case, rows: Sequence[int]) -> Case:
+    """A case of these rows of a parallel beam, as if they were neighbours."""
+    chosen, shape = list(rows), (len(rows), case.geometry.detector_shape[1])
+    unseen = case.unseen
+
+    def cut(geometry: Geometry) -> Geometry:
+        return replace(geometry, detector_shape=shape, axis_row=(len(rows) - 1) / 2)
+
+    return replace(
+        case,
+        projections=np.ascontiguousarray(case.projections[:, chosen]),
+        geometry=cut(case.geometry),
+        grid=replace(case.grid, shape=(len(rows), *case.grid.shape[1:])),
+        truth=case.truth[chosen],
+        weights=None if case.weights is None else np.ascontiguousarray(case.weights[:, chosen]),
+        unseen=unseen and (unseen[0][:, chosen], cut(unseen[1]), unseen[2][:, chosen]),
+    )
+
+
+def judged(case: Case, volume: F32) -> float:
+    """dB of a volume [z, y, x] in 1/pixel."""
+    volume = np.maximum(volume, 0) / np.float32(case.geometry.sample_pitch)
+    if case.unseen is not None:
+        views, geometry, counts = case.unseen
+        left = (strip_integrals(volume, geometry) - views)[counts]
+        return -10 * float(np.log10(np.mean(np.square(left, dtype=np.float64))))
+    y, x = (np.arange(n) - (n - 1) / 2 for n in volume.shape[1:])
+    seen = np.hypot(y[:, None], x) < volume.shape[2] / 2
+    return psnr(case.truth[:, seen], volume[:, seen], case.peak)
+
+
+def _peak_memory() -> float:
+    """Of this process, MB."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+
+
+def play(name: str, case: Case) -> list[Score]:
+    """One competitor on one case, by each setting."""
+    competitor, share = LEAGUE[name], 1.0
+    rows = case.geometry.detector_shape[0]
+    if competitor.slice_by_slice and rows > SLICES:
+        case, share = rows_of(case, [rows * (2 * k + 1) // (2 * SLICES) for k in range(SLICES)]), rows / SLICES
+    competitor.prepare(case)
+    scores: list[Score] = []
+    for setting, make in competitor.settings.items():
+        try:
+            if competitor.compiles and not scores:
+                make(case)
+            begin = time.process_time()
+            volume = make(case)
+        except NotImplementedError:
+            continue
+        seconds = (time.process_time() - begin) * share
+        scores.append(Score(setting, judged(case, volume), seconds, _peak_memory()))
+    return scores
+
+
+def _child(name: str, path: Path) -> list[Score]:
+    warnings.simplefilter("ignore")
+    os.dup2(2, 1)  # what peers print does not belong in the table
+    return play(name, pickle.loads(path.read_bytes()))  # noqa: S301 - written by the parent
+
+
+def table(scores: dict[str, dict[str, list[Score]]]) -> str:
+    """Markdown: a competitor by default, and below it by its best setting; the memory is the largest of all scans."""
+    scans = list(scores)
+    lines = ["| | " + " | ".join(scans) + " | MB |", "|---" * (len(scans) + 2) + "|"]
+    for name in LEAGUE:
+        rows = [scores[scan].get(name, []) for scan in scans]
+        if not any(rows):
+            continue
+        memory = f"{max(score.memory for some in rows for score in some):.0f}"
+        default = [f"{some[0].quality:.2f}, {some[0].seconds:.2g} s" if some else "" for some in rows]
+        lines.append(f"| {name}, {LEAGUE[name].default} | " + " | ".join(default) + f" | {memory} |")
+        if len(LEAGUE[name].settings) > 1:
+            best = [max(some, key=lambda score: score.quality) if some else None for some in rows]
+            cells = [f"{one.quality:.2f}, {one.seconds:.2g} s ({one.setting})" if one else "" for one in best]
+            lines.append(f"| {name}, best | " + " | ".join(cells) + " | |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str]) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scores", type=Path)
+    parser.add_argument("--scans", default=";".join(SCANS), help="parted by semicolons")
+    parser.add_argument("--of", default=";".join(LEAGUE), help="competitors, parted by semicolons")
+    parser.add_argument("--small", action="store_true", help="four rows each")
+    asked = parser.parse_args(arguments)
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = str(THREADS)  # of the competitors' processes
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
+    kept = json.loads(asked.scores.read_text()) if asked.scores.exists() else {}
+    for scan in asked.scans.split(";"):
+        case = SCANS[scan](DATA)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "case")
+            path.write_bytes(pickle.dumps(smaller(case) if asked.small else case))
+            for name in filter(lambda name: LEAGUE[name].is_installed, asked.of.split(";")):
+                with multiprocessing.get_context("spawn").Pool(1) as process:
+                    kept.setdefault(scan, {})[name] = process.apply(_child, (name, path))
+                print(scan, name, *kept[scan][name], file=sys.stderr, flush=True)
+                asked.scores.write_text(json.dumps(kept))
+    order = [scan for scan in SCANS if scan in kept]
+    print(table({scan: {name: [Score(*s) for s in some] for name, some in kept[scan].items()} for scan in order}))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
