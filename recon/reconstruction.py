@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from types import MappingProxyType
@@ -17,6 +18,7 @@ from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedM
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
+from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
 from recon.prep.emission import Emission, weighted_lines
@@ -81,8 +83,10 @@ def reconstruct(
     if isinstance(chosen, SignedMethod) and not chosen.allow_negative:
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
+    grid = grid or Grid.matching(geometry)
+    _warn_of_unseen_cone(chosen, geometry, grid)
     begin = control.now()
-    result = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, int(seed), device), control)
+    result = chosen.run(ReconProblem(data, geometry, grid, use, int(seed), device), control)
     settings = MappingProxyType(dict(result.settings))
     seconds = result.seconds or control.now() - begin
     return replace(result, settings=settings, method=result.method or chosen.name, seconds=seconds)
@@ -111,6 +115,18 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
             f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
             "matter are above 0: -log of the transmission. This method keeps no voxel below 0: change the sign, or set "
             "allow_negative",
+            stacklevel=3,
+        )
+
+
+def _warn_of_unseen_cone(method: Method, geometry: Geometry, grid: Grid) -> None:
+    lean = geometry.unseen_cone
+    if lean and isinstance(method, CostedMethod) and method.costs(geometry, grid).choice.amounts:
+        warnings.warn(
+            f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
+            "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
+            "for it. Give a weight of total variation: fista-tv with tv_weight 0.001, or 0.002 for a plate of sharp "
+            "edges",
             stacklevel=3,
         )
 

@@ -62,10 +62,13 @@ def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool)
     Exit code: 0 valid, 2 wrong configuration or violated limit.
     """
     from beamline.config.load import load
-    from beamline.scan.preflight import dry_run, refuse_violations
+    from beamline.scan.preflight import doubts, dry_run, refuse_violations
 
     with json_events(as_json) as sink:
-        worked = dry_run(load(file, overrides, rehearse=rehearse))
+        loaded = load(file, overrides, rehearse=rehearse)
+        for sentence in doubts(loaded):
+            click.echo(f"Warning: {sentence}", err=True)
+        worked = dry_run(loaded)
         if not as_json:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)

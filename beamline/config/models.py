@@ -165,7 +165,7 @@ class ReconSection(Section):
     """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
     method: MethodName = DEFAULT
     """r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."""
-    seconds: Seconds = 600.0
+    seconds: Seconds = 1800.0
     """Most time after the last view: the volume is made as of a finished scan, and takes longer on a busy machine."""
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0

@@ -70,7 +70,7 @@ class LightOverScan:
     rows: tuple[int, int] = (0, 0)
 
     def with_view(self, row: int, air: float) -> LightOverScan:
-        """After the next view, see in_air."""
+        """The state after the next view, see in_air."""
         if math.isnan(air):
             return self
         recent = (*self.recent, air)[-LASTS:]

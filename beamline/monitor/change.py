@@ -44,7 +44,7 @@ class SampleChange:
     steps: float = 1.0  # since the view before
 
     def beside_columns(self) -> tuple[float, float, float] | None:
-        """Across, down and turn by differences between rows; None if the rows are too much alike.
+        """Shift across, shift down and turn, by differences between rows; None if rows are too similar.
 
         A hump of light as high as the frame, such as a ghost, changes all rows of a column alike. It has no effect
         here, while the motion of a sample has.
@@ -66,7 +66,7 @@ class SampleChange:
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """Inputs of the fit of a view to earlier ones."""
+    """Causes of a change, as inputs of the fit of a view to earlier ones."""
 
     # image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed
     image: CellValues
@@ -82,7 +82,7 @@ class Causes:
 
 
 def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> SampleChange | None:
-    """The change of a view from those before it, oldest first; None without SPAN of them at steps like the last one."""
+    """Change of a view against earlier ones (oldest first); None without SPAN of them at equal steps."""
     if len(before) < SPAN:
         return None
     last = before[-SPAN:]

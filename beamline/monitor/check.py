@@ -1,4 +1,4 @@
-"""Check: the interface of every check of the monitor, its knowledge of the scan, and its findings.
+"""Check: the interface of the monitor's checks, with what they know of the scan and what they report.
 
 A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It looks at one
 frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
@@ -37,7 +37,7 @@ class Policy(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class ScanContext:
-    """Knowledge of the checks: the scan, the references so far, and quantities of the frame that all checks need.
+    """Input of the checks: the scan, the references so far, and quantities of the frame that several checks need.
 
     Attributes:
         saturation: the count from which a pixel is saturated.
@@ -118,7 +118,7 @@ def at_edges(context: ScanContext) -> tuple[float, float]:
 
 
 def more_light(context: ScanContext, exposure: float) -> float:
-    """Light without a sample in a frame of `exposure` s, over that of the flats, which may have their own exposure."""
+    """Light of an `exposure` (s) without a sample, over that of the flats, whose exposure may differ."""
     return exposure / context.flat_exposure
 
 

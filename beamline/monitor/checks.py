@@ -1,4 +1,4 @@
-"""The registry of the monitor's checks, and their bits in a file: those of a frame say which checks flagged it.
+"""The registry of the monitor's checks, and the bits by which a file records which checks flagged a frame.
 
 Adding a check takes its file in this folder and its line in REGISTRY, or in CHECKS of a folder of checks. Its keys in
 the configuration, its bits and the legend in a scan file, and its name in `beamline info` follow.
@@ -54,7 +54,7 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
         nonlocal found
         check = kind()
         if check.name != name:
-            raise ValueError(f"its class calls itself {check.name!r}; expected the entry point's name")
+            raise ValueError(f"its class has the name {check.name!r}; expected the entry point's name")
         _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
         found = _distinct(*found, check)
         return check

@@ -57,7 +57,7 @@ class FrameDigest:
 
 
 def check_block(shape: tuple[int, ...]) -> int:
-    """Pixels a side of the blocks that the checks see of a frame of `shape`, whatever preview its file holds."""
+    """Side in pixels of the blocks in which checks see a frame of `shape`, whatever preview its file holds."""
     return LARGE if shape[1] >= ENOUGH * LARGE else SMALL
 
 
@@ -67,7 +67,7 @@ def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
 
 
 def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
-    """Pixels a side of the blocks of a preview of a frame of `shape`, which may be lower or narrower than a block."""
+    """Side in pixels of the blocks of a preview of a frame of `shape`, which may be smaller than a block."""
     return max(round(n / blocks) for n, blocks in zip(shape, preview, strict=True))
 
 
@@ -144,7 +144,7 @@ def checksum_of(image: NDArray[Any]) -> int:
 
 
 def has_checksum(image: NDArray[Any], stored: int) -> bool:
-    """Whether this is its checksum."""
+    """Whether the pixels have this checksum."""
     return stored == checksum_of(image)
 
 

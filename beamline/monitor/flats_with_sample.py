@@ -36,7 +36,7 @@ Places = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class OddFrame:
-    """A frame that cannot serve: its fault, the figure, the limit, and a sentence with {figures}."""
+    """A frame that cannot be used: its fault, the figure, the limit, and a sentence with {figures}."""
 
     frame: ReferenceFrame
     kind: FaultKind
@@ -46,7 +46,7 @@ class OddFrame:
 
 
 def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
-    """The fault of flats that all have the sample in the beam: they look like one view, and others outshine them.
+    """The fault of flats that all show the sample: they look like one view, and other views are brighter.
 
     In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
     """
@@ -156,7 +156,7 @@ def _depth_over_air(flats: Sequence[Group], darks: Sequence[Group], views: Group
 
 
 def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
-    """Those of the views that hold more than the light of a closed shutter, or than one value."""
+    """The views that have more light than with a closed shutter, and more than one value."""
     base = _base(darks)
     light = [float(np.percentile(_cells(view, base), BRIGHT)) for view in views]
     least = UNLIT * max(light, default=0.0)
@@ -264,7 +264,7 @@ def _outshining(flats: Sequence[Group], darks: Sequence[Group], views: Group) ->
 
 
 def outshone(flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], views: Group) -> list[OddFrame]:
-    """Groups of flats that views outshine in places, and no other flats there: something was in the beam.
+    """Groups of flats that are darker than views in places where other flats are not: something was in the beam.
 
     Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
     """
@@ -308,7 +308,7 @@ def _cells(frame: ReferenceFrame, base: Places | float) -> Places:
 
 
 def lit_places(light: Places) -> NDArray[np.bool_]:
-    """Where images of the beam have light."""
+    """Mask of the places where images of the beam have light."""
     return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
 
 

@@ -14,7 +14,7 @@ from drivers.base.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class LostState:
-    """Empty: the monitor keeps the last good view."""
+    """Empty state: the monitor itself keeps the last good view."""
 
 
 @dataclass(frozen=True)

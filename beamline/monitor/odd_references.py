@@ -1,4 +1,4 @@
-"""Frames labelled dark or flat that cannot serve as one: lit, unlit, saturated, never written, or with the sample in.
+"""Frames labelled dark or flat that cannot be used as one: lit, unlit, saturated, never written, or with the sample.
 
 `beamline.monitor.references` judges groups as they are; here each frame is compared with its group, with the other
 groups, and with the views. One such frame would spoil the mean of its group, however good the others are.
@@ -43,7 +43,7 @@ INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best f
 def without_odd(
     groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
 ) -> tuple[list[list[ReferenceFrame]], list[GroupVerdict]]:
-    """The groups without the frames that cannot serve, without groups that become empty, and what these frames are.
+    """The groups without unusable frames and without groups that become empty; and the verdicts on these frames.
 
     A group with no good frame at all stays whole where its kind has no other: `judge` tells its fault.
 

@@ -65,7 +65,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class OppositeState:
-    """What it remembers: views, the axis in columns of pixels as the first pair gives it, and that it stands aside."""
+    """Kept views, the axis (in columns of pixels) by the first pair, and whether the check is off."""
 
     kept: tuple[Kept, ...] = ()
     axis: float | None = None
@@ -180,7 +180,7 @@ def _folded(angle: float) -> float:
 
 
 def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> Fit | None:
-    """The best fit of the kept view, so many steps later, to the view; None if the view has too little structure.
+    """Best fit of the kept view to a view some steps later; None if the view has too little structure.
 
     Least squares over light, shift across and shift down, from the best whole number of cells on.
     """

@@ -147,7 +147,7 @@ class GroupVerdict:
         return f"{self.kind.name.lower()}s {spans(self.rows)}"
 
     def described(self) -> str:
-        """Its name, and its faults in words."""
+        """Name and faults of the group, in words."""
         return f"The {self.name}: {' '.join(fault.message for fault in self.faults)}"
 
 
@@ -188,7 +188,7 @@ def judge(
 
 
 def is_blank(group: Group) -> bool:
-    """No pixel of its frames holds a number."""
+    """Whether no pixel of its frames holds a number."""
     return all(np.isnan(reference.blocks).all() for reference in group)
 
 
@@ -198,7 +198,7 @@ _BLANK = ReferenceFault(
 
 
 def photons(flats: Group, darks: Group) -> float | None:
-    """Photons in a pixel of the flats where they have light, their median: light squared over the variance it brings.
+    """Median number of photons in a lit pixel of the flats: light squared over the variance that it adds.
 
     Photon transfer (Janesick 2007), of what changes from frame to frame between neighbouring blocks: a beam that
     flickers or moves is no noise. None where frames or blocks are too few, or the flats have no noise by their light.

@@ -1,4 +1,4 @@
-"""Scatter: the usual variation of a figure, so that a limit is never below it; and a running mean of frames."""
+"""Scatter: the usual variation of a figure, below which no limit may lie; and a running mean of frames."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ class FrameScatter:
 
 
 def running_mean(so_far: NDArray[np.float32] | None, newest: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    """The mean with the n-th array."""
+    """The mean of n arrays, from that of n - 1 and the n-th."""
     return newest if so_far is None or n == 1 else so_far + (newest - so_far) / np.float32(n)

@@ -1,4 +1,4 @@
-"""Shake: how far the sample stands beside its way from view to view, at random: vibration, or runout of the stage.
+"""Shake: random displacement of the sample from view to view, by vibration or runout of the stage.
 
 A view that stands x beside its way changes its own comparison with the views before by x, and the next one by -4/3 x:
 there it is the view before, and a third of the velocity. So changes that follow one another have a covariance of -4/3
@@ -61,14 +61,14 @@ class Axis:
 
 @dataclass(frozen=True)
 class Shake:
-    """Both directions, over the views so far."""
+    """Shake across and down, over the views so far."""
 
     across: Axis = field(default_factory=Axis)
     down: Axis = field(default_factory=Axis)
     pairs: int = 0
 
     def with_change(self, change: SampleChange | None) -> Shake:
-        """After the next view; None, or a gap of views, begins a new chain of changes."""
+        """The state after the next view; None, or a gap of views, begins a new chain of changes."""
         if change is None or not 0.5 < change.steps < 1.5 or not math.isfinite(change.across + change.down):
             return Shake(replace(self.across, last=math.nan), replace(self.down, last=math.nan), self.pairs)
         figures = (change.across, change.sigma[0]), (change.down, change.sigma[1])
@@ -80,5 +80,5 @@ class Shake:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Pixels across and down, standard deviations."""
+        """Standard deviations across and down, in pixels."""
         return self.across.size(self.pairs), self.down.size(self.pairs)

@@ -13,7 +13,7 @@ from drivers.base.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class StuckState:
-    """Of the frame before.
+    """Checksum and facts of the frame before.
 
     Attributes:
         checksum, angle: of it.

@@ -23,7 +23,7 @@ class TimingState:
 
 @dataclass(frozen=True)
 class TimingCheck:
-    """Score: how late the frame came, in periods (negative: early).
+    """Score: delay of the frame in periods (negative: early).
 
     Triggers without a frame before it are an INFO: the frame after the gap is as good as any.
     """

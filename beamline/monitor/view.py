@@ -55,7 +55,7 @@ class CellGrid:
         return self.full.shape
 
     def region(self, row: float, col: float, height: float, width: float) -> PixelBox:
-        """Pixels of a box of cells around a place, within the grid."""
+        """Box in pixels of the cells around a place, within the grid."""
         rows, cols = self.shape
         top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
         below, right = min(rows, math.ceil(row + 0.5 + height / 2)), min(cols, math.ceil(col + 0.5 + width / 2))
@@ -115,7 +115,7 @@ def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: flo
 
 
 def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
-    """Light in nine tenths of the places at most, over that of the last good view; before any, over the flats.
+    """Upper bound of the light in nine tenths of the places, over the last good view, or over the flats before one.
 
     A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
     Opaque places do not count.

@@ -1,4 +1,4 @@
-"""Monitor: all checks together. A frame goes in, flags come out; the state of the scan so far is a value.
+"""Monitor: all checks together. It takes frames and returns flags; its state is a value.
 
 `rehearse` shows the checks a toy scan, so that their kernels are compiled before the first view.
 """
@@ -71,7 +71,7 @@ class Monitor:
     saturated: float = 1.0
 
     def drift(self) -> str:
-        """What became of the beam's light over the scan, in words; "" where it stayed within the limit of `beam`."""
+        """Drift of the beam's light over the scan, in words; "" if it is within the limit of `beam`."""
         limits = [check.drift for check in self.checks if isinstance(check, BeamCheck)]
         return self.light.in_words(limits[0], self.context.integrals) if limits else ""
 
@@ -142,7 +142,7 @@ def look(
 def look_past_failures(
     monitor: Monitor, frame: Frame, digest: FrameDigest, begin: Callable[[str], None] = lambda name: None
 ) -> tuple[Monitor, tuple[Flag, ...], tuple[str, ...]]:
-    """`look`, in which a check that fails is off from here on; last, a sentence on each that is now."""
+    """As `look`, but a check that fails is switched off; returns a sentence on each of these, too."""
     failures: list[str] = []
     while True:
         try:
@@ -265,7 +265,7 @@ REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `r
 
 
 def rehearse(monitor: Monitor, begin: Callable[[str], None] = lambda name: None) -> None:
-    """Let the checks of a monitor look at a few small frames; the monitor does not change. `begin`: as of `look`.
+    """Run the checks on a few small frames, to compile them; the monitor does not change. begin: as in `look`.
 
     numba keeps what it compiles: once on a machine it takes up to a minute, then a fraction of a second, and nothing
     for the next scan of the process with the same checks. A check that fails here will say so in the scan.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.report.figures import DPI, WIDTH, png
+from beamline.report.figures import one_panel, png
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.prep.matter import absorbed_dose
@@ -238,10 +238,7 @@ def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
 
 def histograms(statistics: list[KindStatistics]) -> bytes:
     """Pixels against their values, a curve a kind, as PNG; at most 400 bins each."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, 4.2), dpi=DPI, layout="constrained")
-    axes = figure.subplots()
+    figure, axes = one_panel(4.2)
     for each in statistics:
         step = max(1, -(-each.pixels.size // 400))
         starts = np.arange(0, each.pixels.size, step)

@@ -49,7 +49,7 @@ from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
-MOST_SECONDS = 600.0  # of the last round
+MOST_SECONDS = 1800.0  # of the last round
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 

@@ -30,7 +30,7 @@ DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block with its frames and missing triggers; `again`: it takes views again, whose loss is no failure."""
+    """A block with its frames and missing triggers. again: it repeats views, whose loss is no failure."""
 
     block: Block
     taken: BlockTally
@@ -282,7 +282,7 @@ class Acquisition:
         failed: list[BaseException] = []
 
         def attempt(*ways: Callable[[], object]) -> bool:
-            """Try one action after the other until one works: a serial line that failed once often works again."""
+            """Try the actions in turn until one works: a serial line that failed once often works again."""
             failures: list[BaseException] = []
             for way in ways:
                 try:

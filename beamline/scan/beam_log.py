@@ -42,11 +42,11 @@ class BeamLog:
 
     @property
     def readings(self) -> tuple[BeamReading, ...]:
-        """The readings so far, in order of time."""
+        """The readings so far, oldest first."""
         return tuple(self._readings)
 
     def wait_for_reading(self, stop: Callable[[], bool]) -> None:
-        """Where readings are told: wait until one begun after this call is over (or failed), or `stop` returns True."""
+        """If readings are acted on: wait for one that begins after this call, or until `stop` returns True."""
         due = self._begun + 1
         while self._react is not None and self._ended < due and self._thread.is_alive() and not stop():
             time.sleep(PAUSE_POLL)

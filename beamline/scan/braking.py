@@ -37,7 +37,7 @@ Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 
 
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
-    """The confirmation of the frames until the stage stood: by its motion, by their number, or none."""
+    """The way to place frames that came until the stage stood: by its motion, by their number, or not at all."""
     steady, moved, counted = (assigned(ledger, braking, frames, way) for way in (unassigned, by_motion, by_number))
     fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last

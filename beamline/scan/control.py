@@ -51,7 +51,7 @@ class _Requests:
             os.fchmod(self._held, 0o700)
 
     def fault(self) -> str:
-        """Why no request can be trusted, or none can arrive; "" if all is well."""
+        """Reason for which no request can be trusted, or can arrive; "" if all is well."""
         if self._held < 0:
             return ""
         try:
@@ -104,7 +104,7 @@ def _not_private(folder: os.stat_result) -> str:
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, sink: Sink = lambda event: None
 ) -> Iterator[None]:
-    """While the context lasts, verbs for the run in this folder are obeyed; a warning if this is impossible.
+    """Within the context, verbs for the run in this folder are obeyed; a warning if that is impossible.
 
     Raises:
         DataError: the disk does not take the folder for them.
@@ -158,7 +158,7 @@ def running(runs: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Asked:
-    """A verb on its way to the scan of a part of a run, since a time on the monotonic clock."""
+    """A verb that was sent to the scan of a part of a run, at a time of the monotonic clock."""
 
     part: Path
     verb: Verb
@@ -184,7 +184,7 @@ class Asked:
 
 
 def ask(run: Path, verb: Verb) -> Asked:
-    """Send a verb to a running scan. It waits for nothing, so that nothing is in the way of the next verb.
+    """Send a verb to a running scan without waiting, so that the next verb can follow at once.
 
     Raises:
         ConfigError: no scan runs there, or somebody else's.
@@ -198,7 +198,7 @@ def ask(run: Path, verb: Verb) -> Asked:
         raise ConfigError(f"no scan runs in {run}. Nothing was changed.") from None
     if sys.platform != "win32" and (fault := _not_private(folder)):
         raise ConfigError(
-            f"{request.parent}: {fault}. Only who started a scan can tell it something. Nothing was changed."
+            f"{request.parent}: {fault}. Only the user who started a scan can control it. Nothing was changed."
         )
     try:
         with suppress(FileExistsError):

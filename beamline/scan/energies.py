@@ -54,7 +54,7 @@ class SeriesRun:
 
 
 def is_series(folder: Path) -> bool:
-    """Whether it is the folder of a series of energies."""
+    """Whether a folder holds a series of energies."""
     if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
         return False
     return load(folder / CONFIG, environment={}).scan.energies is not None

@@ -101,7 +101,7 @@ class _Pass:
 
     @property
     def so_far(self) -> Ledger:
-        """The settled ledger, as if no further frame came."""
+        """The ledger so far, settled as if no further frame came."""
         return assigned(self.ledger, self.braking, self._exposed, unassigned)
 
     @property
@@ -113,7 +113,7 @@ class _Pass:
         return math.inf if train.first is None else train.first + (train.n - 1) * train.period
 
     def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[tuple[CameraFrame, int, float]]:
-        """The frames that need not wait longer, each with its trigger within the block (or EXTRA) and its angle.
+        """Enter frames; yield those whose trigger is now known (or EXTRA), with trigger in the block and angle.
 
         Args:
             last: no further frame will come, so none waits.

@@ -1,4 +1,4 @@
-"""The live volume of a scan, worked out before it begins: its binning, the views that it takes, and its memory."""
+"""Plan of the live volume of a scan: its binning, its views and its memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.
 
 @dataclass(frozen=True)
 class LivePlan:
-    """The part of a scan for the live volume."""
+    """The part of a scan that its live volume uses."""
 
     binning: int = 1  # binning of rows and columns
     every: int = 1  # one of so many views, in the order taken
@@ -56,7 +56,7 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence on an order of views whose live volume is better before the end; none where the plan has such one."""
+    """A sentence that names an order of views with a better live volume before the end; empty if the plan has it."""
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:
         return ()
@@ -73,7 +73,7 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
 
 
 def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
-    """About how much memory a live volume of so many views of rows and columns takes."""
+    """Estimated memory in bytes of a live volume of so many views, rows and columns."""
     rows, cols = (max(1, n // binning) for n in shape)
     return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
 

@@ -165,7 +165,7 @@ class LiveReconstruction:
             self._sink(Warned(message))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
-        """Wait until it has compiled its kernels or ended, `stop` returns True, or so many real s are over.
+        """Wait until it has compiled its kernels or ended, `stop` returns True, or a timeout (real s) is over.
 
         A time-out is a warning: the scan need not wait for it.
         """
@@ -182,7 +182,7 @@ class LiveReconstruction:
                 return
 
     def finish(self, stop: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
-        """Wait until it ends; the data of its `done` event, or None where it failed.
+        """Wait until it ends; the data of its `done` event, or None if it failed.
 
         Args:
             stop: polled a few times a second; True asks it to end with its present volume.

@@ -46,7 +46,7 @@ def all_of(plan: ScanPlan) -> ScanPlan:
 
 
 class EnergyNeeds(NamedTuple):
-    """What the scan of an energy (keV) needs: s and bytes."""
+    """Time (s) and space (bytes) that the scan of an energy (keV) needs."""
 
     kev: float
     duration: float
@@ -55,7 +55,7 @@ class EnergyNeeds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DryRun:
-    """A scan worked out without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
+    """A scan planned without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
     Of a series of energies it is the first scan; `energies` has what each needs.
     """
@@ -69,7 +69,7 @@ class DryRun:
 
     @property
     def total_bytes(self) -> int:
-        """Of the files of all scans."""
+        """Bytes of the files of all scans."""
         return sum(need.total_bytes for need in self.energies) if self.energies else self.timeline.total_bytes
 
     def lines(self) -> list[str]:
@@ -85,7 +85,7 @@ class DryRun:
         return lines
 
     def data(self) -> Mapping[str, Any]:
-        """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
+        """The numbers behind the lines, for programs, in s, rad, bytes and pixels."""
         worked, views = self.timeline, self.timeline.views
         return {
             "remarks": worked.remarks,
@@ -109,7 +109,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Sentences on values of a configuration that no instrument has, as of a mistaken unit; empty: there is none."""
+    """Sentences on values that no instrument has, as with a mistaken unit; empty if all are plausible."""
     optics, scan = config.optics, config.scan
     energies = (optics.energy_kev, scan.energy, *(scan.energies or ()))
     exposures = (scan.exposure_s, scan.darks.exposure_s, scan.flats.exposure_s)
@@ -129,7 +129,7 @@ def dry_run(
     remaining: Remaining = all_of,
     whole: Collection[float | None] = (),
 ) -> DryRun:
-    """Work out a configuration without devices.
+    """Compute the plan of a configuration without devices.
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
@@ -238,7 +238,7 @@ def preflight(
     remaining: Remaining = all_of,
     check_stop: Callable[[], None] = lambda: None,
 ) -> ReadyScan:
-    """Ask the devices what they can do, and work the plan out for them. Nothing moves.
+    """Ask the devices for their limits, and compute the plan for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.

@@ -69,7 +69,7 @@ def room(timeline: Timeline) -> int:
 
 
 def frames_in_memory(timeline: Timeline) -> int:
-    """Most frames of a scan in memory at one time: waiting, in work, and on their way from the camera."""
+    """Largest number of frames in memory at a time: waiting, being written, and coming from the camera."""
     return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
 
 
@@ -81,7 +81,7 @@ _Item = _Checked | BaseException | threading.Event | None
 
 @dataclass(frozen=True, eq=False)
 class Consequences:
-    """What follows from flags while a scan runs.
+    """Effects of flags on a running scan.
 
     Attributes:
         react: told the flags of each frame.
@@ -186,7 +186,7 @@ class Recorder:
         self._raise_failure()
 
     def finish(self) -> None:
-        """Wait until every frame that was put is written; no other may follow."""
+        """Wait until all queued frames are written; no frame may be put afterwards."""
         self._enqueue(None)
         while self.hangs:
             self._refuse_stall()
@@ -195,7 +195,7 @@ class Recorder:
 
     @property
     def unjudged(self) -> str:
-        """Which frames so far the monitor did not look at, in words; "" where it has looked at all."""
+        """Frames that the monitor has not checked, in words; "" if it has checked all so far."""
         if not self._unjudged:
             return ""
         frames = f"{count(len(self._unjudged), 'frame')} ({spans(self._unjudged)})"
@@ -211,7 +211,7 @@ class Recorder:
 
     @property
     def drift(self) -> str:
-        """What became of the light over the frames so far, in words; "" where it stayed within its limit."""
+        """Drift of the light over the frames so far, in words; "" if it is within its limit."""
         return self._monitor.drift()
 
     @property
@@ -221,7 +221,7 @@ class Recorder:
 
     @property
     def alarmed_views(self) -> int:
-        """Number of the views among these."""
+        """Number of views among the frames with an alarm."""
         return len(self._alarmed & self._triggers.keys())
 
     @property
@@ -241,13 +241,13 @@ class Recorder:
         return {frame for flag in self._found if which(flag) for frame in flag.frames} - self._replaced
 
     def expect_more(self, n: int, seconds: float) -> None:
-        """Frames beside the timeline's come next; may be called while no frame waits."""
+        """Announce frames that the timeline does not have; may be called while no frame waits."""
         self._retaking = True
         self._progress.expect_more(self.n_frames, n, seconds)
 
     @property
     def hangs(self) -> bool:
-        """A frame is still being written; after `finish` this means that the disk does not answer."""
+        """Whether a frame is still being written; after `finish` this means that the disk does not answer."""
         return self._thread.is_alive()
 
     def _enqueue(self, item: Frame | threading.Event | None) -> None:

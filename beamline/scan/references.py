@@ -26,7 +26,7 @@ class ReferenceLog:
         self._before = FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """Record a frame, in the order of the file; also the first views, whose light the flats must have.
+        """Record a frame, in the order of the file; also the first views, to compare their light with the flats.
         `digest`: that of the checks."""
         block = check_block(frame.counts.shape)
         if frame.kind in REFERENCES:

@@ -45,7 +45,7 @@ _IDENTITY = (  # facts about a device that stay the same from scan to scan and d
 
 @dataclass(frozen=True)
 class ResumableRun:
-    """A run that can go on.
+    """A run that can be resumed.
 
     Attributes:
         run: its folder.
@@ -77,11 +77,11 @@ class ResumableRun:
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
-        """The part of the plan that the run lacks."""
+        """The part of the plan that is still missing."""
         return replace(plan, stored=self.views, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
-        """Make ordinary files of the parts whose writer died, join them, and make the folder of the new part.
+        """Recover parts whose writer died, join the parts, and make the folder of the new one.
 
         Raises:
             ConfigError: plan, frames or devices are not what they were; nothing was changed.
@@ -96,13 +96,13 @@ class ResumableRun:
         return create_part(self.run)
 
     def join(self, part: Path) -> tuple[Path, int]:
-        """Join the parts with the new one: the file that has them all, and its frames."""
+        """Join the parts and the new one; returns the joined file and its number of frames."""
         joined = self.run / JOINED
         return joined, join([*self.parts, part], joined)
 
 
 class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
-    """A run lacks no frame, but a file was not closed, or its parts are not joined: `recover_run` does both."""
+    """A run has all frames, but a file was not closed or its parts are not joined; `recover_run` does both."""
 
 
 class NothingMissing(ConfigError):  # noqa: N818 - likewise
@@ -115,7 +115,7 @@ class NoFrame(ConfigError):  # noqa: N818 - likewise
 
 @contextmanager
 def open_for_resume(run: Path, given: Config | None = None) -> Iterator[ResumableRun]:
-    """The run in this folder, held while the context lasts, so that no other process goes on with it.
+    """Hold the run in this folder within the context, so that no other process can resume it.
 
     Args:
         given: a configuration that must be the run's.

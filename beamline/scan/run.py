@@ -181,7 +181,7 @@ class _Run:
 
     @property
     def volume(self) -> Path:
-        """The file of the run's volume: a run has one, also where it was resumed."""
+        """File of the volume; a resumed run has one, too."""
         return (self.series.run if self.series else self.folder) / RECON
 
     @cached_property
@@ -193,7 +193,7 @@ class _Run:
         return ReferenceReport(self.config.references, self.ready.plan.exposure, self.sink)
 
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
-        """The whole run, and its last event: `done` or `failed`."""
+        """Run the whole scan, and end it by the event `done` or `failed`."""
         try:
             self.states.enter(State.PREPARING, "Preparing" if self.series is None else self.series.in_words)
             result = self._scan(live, release)

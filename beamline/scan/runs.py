@@ -60,7 +60,7 @@ class Run:
 
     @property
     def over(self) -> bool:
-        """Whether nothing more happens, unless it is resumed."""
+        """Whether the run has ended; it may be resumed."""
         return self.state == DIED or self.state in _ENDED
 
 
@@ -80,7 +80,7 @@ def newest(folder: Path) -> Path:
 
 
 def describe(run: Path) -> Run:
-    """The facts of a run by its log, or by its files if the log ended early. No pixel is read."""
+    """Read the facts of a run from its log, or from its files if the log ended early. No pixel is read."""
     parts = parts_of(run)
     heads = [_head(part) for part in parts]
     frames: int | None = 0

@@ -48,7 +48,7 @@ class Supervision:
 
 @dataclass(frozen=True)
 class BeamLimits:
-    """When a scan waits for the beam, in the beam monitor's unit."""
+    """Intensities at which a scan pauses and resumes, in the beam monitor's unit."""
 
     pause_below: float  # a reading below it pauses the scan
     resume_above: float  # readings of at least so much mean that the beam is back

@@ -57,7 +57,7 @@ INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=be
 def watched(
     folder: Path, sink: Sink, stop: StopRequest | None = None, pause: PauseRequest | None = None
 ) -> Iterator[None]:
-    """A watchdog for the run in this folder as long as the context lasts; a warning if there is none.
+    """Within the context a watchdog looks after the run in this folder; a warning if it cannot be started.
 
     A watchdog that ends meanwhile is reported and replaced.
 
@@ -155,8 +155,8 @@ class _Keeper:
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
-    """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed. `say`: takes a sentence
-    on each step."""
+    """Stop the stage, disarm its trigger output and close the shutter; True if all obeyed. say: gets a sentence on each
+    step."""
     stage, shutter = config.devices.stage, config.devices.shutter
     apart = shutter if isinstance(shutter, FoundShutter) else None
     closed = "the shutter is moved by hand"

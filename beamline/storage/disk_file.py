@@ -42,7 +42,7 @@ class UnderHdf5:
         return str(self.path)  # which is the name of the file for HDF5
 
     def stat(self) -> os.stat_result:
-        """Of the file that is open, whatever has its name now."""
+        """Status of the open file, whatever has its name now."""
         return os.fstat(self._file.fileno())
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
@@ -53,19 +53,19 @@ class UnderHdf5:
         return self._at
 
     def readinto(self, buffer: Any) -> int:
-        """Zeros where nothing was written yet."""
+        """Read into a buffer; zeros where nothing was written yet."""
         out = memoryview(buffer).cast("B")
         self._read(self._at, out)
         return len(out)
 
     def read(self, n: int) -> bytes:
-        """h5py asks whether it is there, and calls the other."""
+        """Exists because h5py looks for it; h5py calls `readinto`."""
         out = bytearray(n)
         self.readinto(out)
         return bytes(out)
 
     def flush(self) -> None:
-        """Nothing is held back here."""
+        """Does nothing: no data are buffered here."""
 
     def close(self) -> None:
         self._file.close()
@@ -85,7 +85,7 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file that a program of ours is writing, or did until it died, as if it were closed.
+    """A file that a program of ours is writing, or wrote until it died, shown as if it were closed.
 
     A refresh by HDF5 finds its present state. Torn blocks are read as whole ones.
     """
@@ -163,7 +163,7 @@ class DiskFile(UnderHdf5):
             raise error
 
     def finish(self) -> None:
-        """Bring all of it to the disk, read it back, and compare. The memory is that of a block.
+        """Bring the file to the disk, read it back and compare, a block at a time.
 
         A write that a later one changed in part is not compared: these are metadata.
 

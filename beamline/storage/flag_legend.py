@@ -1,4 +1,4 @@
-"""Flags of the monitor in a scan file: the bits of each frame, and the legend, which says what each bit stands for."""
+"""Flags of the monitor in a scan file: the bits of each frame, and the legend with the meaning of each bit."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Mark:
 
     @property
     def valid(self) -> bool:
-        """No check raised an alarm."""
+        """Whether no check raised an alarm."""
         return self.bits & ALARMS == 0
 
 
@@ -69,7 +69,7 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
 
 
 def place_of(flag: Flag) -> int:
-    """The check's place in the legend, and in scores and regions."""
+    """Index of the check in the legend, and in scores and regions."""
     return _PLACES[flag.check]
 
 
@@ -105,7 +105,7 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """[row] what the checks found at each frame of a file; a flag that holds for earlier rows marks them."""
+        """Marks [row] of the frames of a file by these flags; a flag for earlier rows marks these, too."""
         flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
         assert flags.scores is not None and flags.regions is not None
         for flag in chain.from_iterable(found):
@@ -130,28 +130,28 @@ class FrameFlags:
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
-        """The same by today's checks, without checks that do not exist now."""
+        """The same flags with today's bits, without checks that no longer exist."""
         return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """[frame]: some check flagged it, at any level."""
+        """Whether a check flagged each frame [frame], at any level."""
         return np.asarray(self.bits != 0)
 
     @property
     def alarmed(self) -> NDArray[np.bool_]:
-        """[frame]: for some check it was an alarm."""
+        """Whether a check raised an alarm for each frame [frame]."""
         mask = sum(1 << entry.alarm_bit for entry in self.legend)
         return np.asarray((self.bits & np.uint64(mask)) != 0)
 
     def of(self, frames: NDArray[np.integer] | NDArray[np.bool_]) -> FrameFlags:
-        """The flags of some of the frames."""
+        """The flags of some frames."""
         scores = None if self.scores is None else self.scores[frames]
         regions = None if self.regions is None else self.regions[frames]
         return FrameFlags(self.bits[frames], self.legend, scores, regions)
 
     def after(self, n: int) -> FrameFlags:
-        """The flags with `n` frames that no check has seen put in front."""
+        """The flags after `n` further frames, which no check has seen, at the front."""
         bits = np.concatenate([np.zeros(n, self.bits.dtype), self.bits])
         scores = None if self.scores is None else np.pad(self.scores, ((n, 0), (0, 0)), constant_values=np.nan)
         regions = None if self.regions is None else np.pad(self.regions, ((n, 0), (0, 0), (0, 0)), constant_values=-1)

@@ -152,7 +152,7 @@ def _open_by_name() -> dict[int, Any]:
 
 @contextmanager
 def opened_itself(path: Path) -> Iterator[None]:
-    """What the block opens by this name is the regular file of the name, and not what a link led to meanwhile.
+    """Check that the block opened the regular file of this name, and not the target of a link that replaced it.
 
     For files in another user's folder, as HDF5 opens by name. On Windows, where its handles cannot be looked at, a link
     that still stands there is found.
@@ -179,7 +179,7 @@ def _apart(path: Path, follow: bool) -> h5py.File:
     """The file by a driver that HDF5 shares with no other."""
     head = superblock(path)
     if head is None or not head.intact or (head.open_for_writing and not head.grows):
-        raise (NotReadyError if follow else DataError)(f"{path} is just being made by this program. Try again.")
+        raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
     with readable(path):
         return h5py.File(GrowingFile(path, head), "r")
 
@@ -278,7 +278,7 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
 
 @contextmanager
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
-    """A new file. At the end of the block it is on the disk, and was read back and compared with what was written.
+    """Create a file. At the end of the block it is on the disk, read back and compared.
 
     Raises:
         OSError: the disk refused the bytes or holds others; the file is closed and stays.
@@ -289,7 +289,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
 
 @contextmanager
 def changed(path: Path) -> Iterator[NewFile]:
-    """An existing file, open to be changed, as by `created`; what is changed when the disk refuses stays half done."""
+    """Open an existing file to change it, as `created` does; a disk error leaves the changes half done."""
     with _written(path, "r+", None) as file:
         yield file
 
@@ -351,7 +351,7 @@ def text_of(item: h5py.Dataset) -> str:
 
 
 def is_foreign(item: h5py.Dataset) -> bool:
-    """Text behind a link in a file that holds no images: a scan has no business with it, and its reader shows it."""
+    """Whether a text is behind a link in a file without images: no scan needs it, and its reader would print it."""
     if item.dtype.kind in "uifb":
         return False
     if item.is_virtual:
@@ -374,7 +374,7 @@ _HOLD_IMAGES = dict[int, bool]()  # whether an open file holds images, by HDF5's
 
 
 def images_in(file: h5py.File) -> Iterator[h5py.Dataset]:
-    """Every dataset that may be images, once, also behind links."""
+    """Each dataset that may hold images, once, also behind links."""
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -439,7 +439,7 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 
 def broken_link(group: h5py.Group, path: str) -> str:
-    """Where a path ends at a link that leads nowhere, and where that should lead; "" for a path that is not there."""
+    """A sentence if a path ends at a broken link, with the link's target; "" if not."""
     here: Any = group
     for name in path.strip("/").split("/"):
         if not isinstance(here, h5py.Group):
@@ -453,7 +453,7 @@ def broken_link(group: h5py.Group, path: str) -> str:
 
 
 def refuse_broken(group: h5py.Group, path: str) -> None:
-    """Raises DataError where a path ends at a link that leads nowhere."""
+    """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
         raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
 
@@ -493,7 +493,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
         )
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
     if lost := missing_links(item):
-        raise DataError(f"{item.file.filename} draws its angles from {lost[0]}, which is not there or differs.")
+        raise DataError(f"{item.file.filename} takes its angles from {lost[0]}, which is missing or has another shape.")
     return np.ravel(np.asarray(values_of(item), np.float64)) * factor
 
 
@@ -509,7 +509,7 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 
 
 def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
-    """Files, and datasets of its own file, that a virtual dataset draws on and that cannot be read, or differ in shape.
+    """Sources of a virtual dataset, files or datasets of its own file, that cannot be read or differ in shape.
 
     For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
     Virtual sources are followed through `within` files at most.

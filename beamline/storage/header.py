@@ -1,4 +1,4 @@
-"""Header: what somebody else's file says of its voxels, checked before any of them is read.
+"""Header: the shape, type and place of a foreign file's voxels, checked before any of them is read.
 
 Each function raises ValueError, which the reader of a format turns into a DataError with the path.
 """
@@ -33,7 +33,7 @@ def shape_of(said: Any, what: str = "shape") -> tuple[int, int, int]:
 
 
 def numbers_of(said: Any, n: int, what: str) -> tuple[float, ...]:
-    """So many finite numbers."""
+    """A tuple of `n` finite numbers."""
     if not isinstance(said, list) or len(said) != n or not all(_is_number(each) for each in said):
         raise ValueError(f"its {what} is {_brief(said)}; expected {n} numbers")
     return tuple(map(float, said))
@@ -51,14 +51,16 @@ def dtype_of(said: Any) -> np.dtype[Any]:
 
 
 def require_held(shape: tuple[int, int, int], dtype: np.dtype[Any], begin: int, stored: int) -> None:
-    """The voxels, from byte `begin` on, are within the bytes that are stored."""
+    """Raise ValueError unless the file stores all voxels from byte `begin` on."""
     needed = math.prod(shape) * dtype.itemsize
     if begin < 0 or begin + needed > stored:
-        raise ValueError(f"it says {' x '.join(map(str, shape))} voxels from byte {begin} on, and has {stored} bytes")
+        raise ValueError(
+            f"its header states {' x '.join(map(str, shape))} voxels from byte {begin} on, but it has {stored} bytes"
+        )
 
 
 def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an .npy whose file has all its values; the file is left where it was."""
+    """Shape and type of an .npy; ValueError unless the file has all its values. Its position stays."""
     at, stored = file.tell(), os.fstat(file.fileno()).st_size
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -66,7 +68,7 @@ def require_npy(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     needed = file.tell() + math.prod(map(int, shape)) * dtype.itemsize
     file.seek(at)
     if any(n < 0 for n in shape) or needed > stored:
-        raise ValueError(f"it says the shape {_brief(shape)} of {dtype}, and has {stored} bytes")
+        raise ValueError(f"its header states the shape {_brief(shape)} of {dtype}, but it has {stored} bytes")
     return shape, dtype
 
 

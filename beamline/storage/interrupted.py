@@ -1,4 +1,4 @@
-"""Runs that were interrupted: the scan and the volume of a run, and what can be done with one that ended early.
+"""Interrupted runs: the scan and the volume of a run, and the next step for one that ended early.
 
 Every command that meets such a run says the same, by `next_step`.
 """
@@ -61,7 +61,7 @@ def _no_run(folder: Path, wanted: str) -> Path:
 
 
 def next_step(scan: Path) -> str:
-    """What can be done with a scan whose program still runs, has died, or ended early; "" where nothing is missing."""
+    """A sentence on the next step for a scan that still runs, died or ended early; "" if nothing is missing."""
     run = run_of(scan.parent) if scan.name in (SCAN, JOINED) and (scan.parent / CONFIG).is_file() else None
     if run is not None:
         parts = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file()]

@@ -24,7 +24,7 @@ _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piec
 
 
 class PartlyChangedError(DataError):
-    """The disk refused when the file had been changed in part."""
+    """A disk error when the file had been changed in part."""
 
 
 class Overlay(UnderHdf5):
@@ -40,7 +40,7 @@ class Overlay(UnderHdf5):
         self._pages: dict[int, bytearray] = {}
 
     def copy(self) -> Self:
-        """The same file with the same writes; later ones are its own."""
+        """A copy of the overlay; later writes go to one of the two."""
         made = type(self)(self.path, self._size)
         made._pages = {page: bytearray(data) for page, data in self._pages.items()}
         return made
@@ -78,13 +78,13 @@ class Overlay(UnderHdf5):
 
     @property
     def head(self) -> Superblock:
-        """The head of the file with the writes."""
+        """Superblock of the file with the writes."""
         self.seek(0)
         return Superblock(self.read(SIZE), self._there)
 
     @property
     def room(self) -> int:
-        """Bytes that the file takes beyond those that it has; it never becomes shorter."""
+        """Bytes by which the file grows; it never becomes shorter."""
         return max(0, self._size - self._there)
 
     @property
@@ -121,12 +121,12 @@ class Overlay(UnderHdf5):
             why = error.strerror or str(error)
             if longer:
                 raise PartlyChangedError(
-                    f"{self.path} is changed in part only: its disk does not take the rest ({why}). Its frames are "
-                    "there. Mend the disk, then run `beamline recover` on it."
+                    f"{self.path} is changed only in part: its disk refused the rest ({why}). Its frames "
+                    f"are safe. Mend the disk, then run `beamline recover` on it."
                 ) from error
             with suppress(OSError):
                 os.truncate(self.path, self._there)
-            raise DataError(f"{self.path} cannot be made longer ({why}). What was in it is as it was.") from error
+            raise DataError(f"{self.path} cannot be made longer ({why}). Its content is unchanged.") from error
 
     def _change(self, file: Any) -> None:
         before = Superblock(bytes(self._on_disk(0)[:SIZE]), self._there)

@@ -129,7 +129,7 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
-    """Make, or make again, the file with the frames of all parts, in this order. Returns their number.
+    """Make or replace the file with the frames of all parts, in this order; returns their number.
 
     Args:
         parts: closed files of one scan, each with a frame at least. They are only read.
@@ -190,12 +190,12 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
 
 
 def to_join(run: Path) -> str:
-    """How the parts of a run become one file, as the end of a sentence."""
+    """The command that joins the parts of a run, as the end of a sentence."""
     return f"`beamline recover {run}` joins the parts that are there"
 
 
 def require_joined(file: h5py.File) -> None:
-    """DataError if a joined file draws frames from changed parts, or lacks a part.
+    """Raise DataError if a joined file takes frames from changed parts, or lacks a part.
 
     A file with frames of its own, such as an archived one, always passes.
     """
@@ -275,7 +275,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
 
 
 def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> None:
-    """Write the first `n` rows of a scan file, and all that it says beside its rows, into a new, finished file."""
+    """Copy the first `n` rows of a scan file, with all that is not in rows, into a new, finished file."""
     _copy(file["/"], target, {path: file[path][:n] for path in layout.GROWING})
     for path in _VIRTUAL:
         item = file[path]

@@ -72,7 +72,7 @@ class PoseTable:
 
     @property
     def leans(self) -> bool:
-        """A row of a view may show several slices."""
+        """Whether a row of a view may show several slices."""
         return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
@@ -220,7 +220,7 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
         raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
     if CENTRES_KEPT in parameters:
-        raise ValueError(f"{path} was made with vectors of each view, which it does not keep: give their file")
+        raise ValueError(f"{path} was made with vectors of each view, but does not hold them: give their file")
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
     turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
@@ -266,7 +266,7 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
     directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:
         raise _NoPosesError(
-            f"{path}: the sample moves in {directions}, and NeXus does not say where on the detector; {_HOW}"
+            f"{path}: the sample moves in {directions}, but NeXus does not state the directions on the detector; {_HOW}"
         )
     named = {way[-1] for way in ways} - {"0"}
     if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):

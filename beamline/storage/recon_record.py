@@ -1,4 +1,4 @@
-"""ReconRecord: what is known of a volume, the same in its file, in the event of its end and in a script."""
+"""ReconRecord: the record of a volume, the same in its file, in the event `done` and in scripts."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class VolumeField:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ReconRecord:
-    """The record of a volume: what was made, of what, how it was judged, and where it lies.
+    """The record of a volume: its method, settings, data, figures of merit and files.
 
     The same value is in the file of the volume, in the event `done` and in the results of `beamline.api`.
 
@@ -114,7 +114,7 @@ class ReconRecord:
 
     @property
     def grid(self) -> Grid:
-        """Of the volume, which is not read for it."""
+        """Grid of the volume, whose voxels are not read for it."""
         held: Volume = self.__dict__["volume"]
         return held.grid
 
@@ -135,39 +135,39 @@ class ReconRecord:
 
     @property
     def ending(self) -> Ending:
-        """How it ended, as its parameters say."""
+        """How the reconstruction ended, by its parameters."""
         early, *others = (self.parameters.get(name, "") for name in _ENDS)
         return Ending(bool(early), *map(str, others))
 
     @property
     def ended_early(self) -> bool:
-        """It was stopped, and is the volume reached by then."""
+        """Whether the reconstruction was stopped before its end."""
         return self.ending.early
 
     @property
     def seconds_of_volumes(self) -> tuple[float, ...]:
-        """When each of several volumes in time was, from the first view on; empty where there is one volume."""
+        """Time of each of several volumes, in s from the first view on; empty for one volume."""
         return () if self.series is None else tuple(self.series.seconds.tolist())
 
     @property
     def displacements(self) -> list[dict[str, float]]:
-        """Where the sample stood in each of several scans: the fields of `recon.voxels.displacement.Displacement`."""
+        """Displacement of the sample in each of several scans, with the fields of `recon.voxels.displacement`."""
         rows: Any = self.parameters.get("displacements", ())
         return [dict(zip(_MOVE, map(float, row), strict=True)) for row in rows]
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """`metrics`, as scripts call them."""
+        """Figures of merit; the name of `metrics` in scripts."""
         return self.metrics
 
     @property
     def settings(self) -> Mapping[str, Value]:
-        """`parameters`, as scripts call them."""
+        """Settings; the name of `parameters` in scripts."""
         return self.parameters
 
     @property
     def units(self) -> str:
-        """`unit`, as scripts call it."""
+        """Unit of the voxels; the name of `unit` in scripts."""
         return self.unit
 
     def __repr__(self) -> str:
@@ -179,7 +179,7 @@ class ReconRecord:
         return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
 
     def event_values(self) -> dict[str, Any]:
-        """What the event `done` says of it, by name, in the order of its line."""
+        """Values of the event `done`, by name, in the order of its line."""
         others = {
             "outputs": self.outputs or None,
             "displacements": self.displacements or None,

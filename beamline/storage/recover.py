@@ -1,4 +1,4 @@
-"""recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept.
+"""recover: turns the file of a writer that died into an ordinary scan file, in place, with every committed frame.
 
 HDF5 mends the file in memory, and the result is read. Only then the few bytes that differ are written (see
 storage.overlay). Whatever stops it, it can be run again. So a file of 30 GB needs a few kB of its disk and no copy.
@@ -38,7 +38,7 @@ COMPARED = 2**31  # bytes of the last frames: more than a machine that loses pow
 
 @dataclass(frozen=True)
 class Recovered:
-    """The result for a file.
+    """Result of `recover` for a file.
 
     Attributes:
         changed: whether the file was changed.

@@ -1,4 +1,4 @@
-"""Scratch arrays: in a file without a name, which vanishes however the process ends."""
+"""Scratch arrays in a file without a name, which vanishes however the process ends."""
 
 from __future__ import annotations
 

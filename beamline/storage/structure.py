@@ -38,18 +38,20 @@ def require_harmless(file: h5py.File) -> None:
             continue
         seen.add(path.resolve())
         if len(seen) > FILES:
-            raise DataError(f"{file.filename} draws on more than {FILES} files, one by another. Nothing was read.")
+            raise DataError(
+                f"{file.filename} links to more than {FILES} files, directly or through others. Nothing was read."
+            )
         with suppress(*_DAMAGED), h5py.File(path, "r", locking=False) as other:
             waiting += _looked_at(other, path)
 
 
 def require_inside(file: h5py.File) -> None:
-    """DataError where a file draws on one outside of its folder."""
+    """Raise DataError if a file links to one outside of its folder."""
     path = Path(file.filename)
     for other in _looked_at(file, path):
         if path.resolve().parent not in other.resolve().parents:
             raise DataError(
-                f"{path} draws on {other}, outside of its folder. Name the file itself to have that read, too."
+                f"{path} links to {other}, outside of its folder. Name the file itself to have that read, too."
             )
 
 
@@ -73,7 +75,7 @@ def _looked_at(file: h5py.File, path: Path) -> list[Path]:
                     require_regular(place)
                 except OSError as error:
                     raise DataError(
-                        f"{path} draws on {name}, which no scan does ({error.strerror}). Nothing was read."
+                        f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
                     ) from error
                 files[place] = None
     return [*files]

@@ -46,7 +46,7 @@ class Superblock:
 
     @property
     def missing(self) -> int:
-        """Bytes missing at the end of the file, by its head."""
+        """Bytes that are missing at the end of the file, by its head."""
         return max(0, self.end - self.size)
 
     @property

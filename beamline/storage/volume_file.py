@@ -181,7 +181,7 @@ def _checked_nifti(path: Path, header: Any) -> tuple[np.dtype[Any], int]:
     """Type and bytes of the values; DataError for a header that no volume of real numbers has."""
     magic = bytes(header["magic"]).rstrip(b"\0")
     if int(header["sizeof_hdr"]) != 348 or magic != b"n+1":
-        raise DataError(f"{path} is no single-file NIfTI-1 (header of {header['sizeof_hdr']} bytes, magic {magic!r}).")
+        raise DataError(f"{path} is no NIfTI-1 in one file (header of {header['sizeof_hdr']} bytes, magic {magic!r}).")
     dtype, dims = header.get_data_dtype(), header["dim"].tolist()
     if dtype.kind not in "iuf" or int(header["bitpix"]) != 8 * dtype.itemsize or dtype.itemsize > 8:
         kind, bits = header["datatype"], header["bitpix"]

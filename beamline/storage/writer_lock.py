@@ -1,4 +1,4 @@
-"""Locks on files: ours on a file that is written, and HDF5's, where they fail.
+"""Locks on files: ours on a file that is being written, and failures of HDF5's own.
 
 Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
 however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read
@@ -54,7 +54,7 @@ _OFF = {"FALSE", "0", "BEST_EFFORT"}
 
 
 class LockFailure(Enum):
-    """Why HDF5 got no lock."""
+    """Reason for which HDF5 got no lock."""
 
     NO_LOCKS = "no locks"
     HELD = "held"
@@ -83,7 +83,7 @@ def no_locks(folder: Path) -> str:
 
 
 def no_locks_sentence(place: Path, number: int | None = None) -> str:
-    """The cause, and the way."""
+    """A sentence with the cause and the remedy."""
     told = "" if number is None else f" (errno {number})"
     return (
         f"the file system of {place} has no file locks{told}, as NFS is often mounted, and HDF5 creates no file there; "
@@ -165,7 +165,7 @@ def abandoned(path: Path) -> bool:
 
 
 class WriterWatch:
-    """Tells who follows a growing file that its writer is gone: at once by the lock, or else by its silence.
+    """Tells the follower of a growing file that its writer is gone: at once by the lock, or else by its silence.
 
     Args:
         now: s, by the clock of the follower.
@@ -179,7 +179,7 @@ class WriterWatch:
         self._was_held = self._held = held(path)
 
     def lost(self, now: float, grew: bool, finished: Callable[[], bool]) -> str:
-        """What shows that the writer is gone, as the end of a sentence; "" while it is not.
+        """The sign that the writer is gone, as the end of a sentence; "" while there is none.
 
         Args:
             grew: since the last call.

@@ -241,6 +241,15 @@ class Geometry:
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
 
     @property
+    def unseen_cone(self) -> float:
+        """Half angle, in radians, of the cone of wave vectors about the rotation axis that no view measures.
+
+        It is the least lean of the axis along the beam; 0 where that is at most half a pixel over the field.
+        """
+        least = float(np.abs(self.tilt).min())
+        return least if self.reach * math.sin(least) > 0.5 * self.sample_pitch else 0.0
+
+    @property
     def is_off_middle(self) -> bool:
         """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
         cols = self.detector_shape[1]

@@ -10,6 +10,7 @@ numba imports this module when it makes its first cache, as LOCATORS names it; n
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import warnings
 from collections.abc import Iterator
@@ -82,5 +83,6 @@ def _in_memory_where_refused(cache: caching.Cache) -> Iterator[None]:
 
 
 _told = list[str]()
+os.environ.pop("NUMBA_CACHE_LOCATOR_CLASSES", None)  # programs begun from here may know numba, and not this module
 caching.IndexDataCacheFile = KernelCacheFile
 caching.Cache._guard_against_spurious_io_errors = _in_memory_where_refused

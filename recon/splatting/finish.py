@@ -25,7 +25,7 @@ from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from recon.splatting.splat import project, voxelize
+from recon.splatting.splat import project, voxel_means
 from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
@@ -189,7 +189,7 @@ def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: F
     gaussians = gaussians.select(outside.any(dim=1))
     if not gaussians.n:
         return None
-    inside = voxelize(gaussians, grid, truncation=settings.truncation).numpy()
+    inside = voxel_means(gaussians, grid, views, truncation=settings.truncation).numpy()
     model = project(gaussians, views, truncation=settings.truncation, model=settings.rays).numpy()
     return model - Projector(views, grid).forward(np.maximum(inside, 0))
 

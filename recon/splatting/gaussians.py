@@ -16,6 +16,7 @@ from recon.base.settings_check import check_settings
 if TYPE_CHECKING:
     from torch import Tensor
 
+_FAINTEST = 1e-30  # density units
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 
@@ -105,6 +106,17 @@ class Gaussians:
         """The Gaussians at `index` (a mask or positions), as copies."""
         some: dict[str, Any] = {name: getattr(self, name)[index] for name in _PARAMETERS}
         return replace(self, **some)
+
+    def widened(self, variance: float) -> Gaussians:
+        """With this variance (mm²) more along every direction, and the same mass."""
+        import torch
+
+        if variance <= 0:
+            return self
+        wider = torch.sqrt(self.scales**2 + variance)
+        density = (self.densities * (self.scales / wider).prod(1) / self.density_unit).double().clamp(min=_FAINTEST)
+        raw = torch.from_numpy(inverse_softplus(density.detach().numpy())).to(self.raw_densities.dtype)
+        return replace(self, log_scales=wider.log(), raw_densities=raw)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The raw parameters as numpy arrays by name."""

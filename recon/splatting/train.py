@@ -46,7 +46,7 @@ from recon.splatting.initialise import (
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import MODEL_STEPS, FitSettings, growth, in_steps, tv_size, tv_weight
-from recon.splatting.splat import voxelize
+from recon.splatting.splat import voxel_means
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods.fista_tv import FistaTv
@@ -233,7 +233,9 @@ class _Run:
     def model(self) -> tuple[Volume, Gaussians]:
         """The volume of the Gaussians, and these, turned as the rows see them."""
         model = turned_by_rows(fit.gaussians_of(self.state, self.fitting.backend), self.views.all_geometry, 1)
-        filled = voxelize(model, self.problem.grid, truncation=self.method.fit.truncation).numpy()
+        filled = voxel_means(
+            model, self.problem.grid, self.fitting.geometry, truncation=self.method.fit.truncation
+        ).numpy()
         return Volume(filled, self.problem.grid), model
 
     def report(self, at: float) -> None:

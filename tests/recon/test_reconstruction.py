@@ -19,6 +19,7 @@ import recon.splatting.initialise
 from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
 from recon.axis_held_out import axis_by_views
+from recon.base.geometry import Geometry
 from recon.methods import build, by_name, names_of_one_volume
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -177,7 +178,9 @@ def test_classical_methods_by_the_same_call_beat_fbp(
     baseline = psnr(truth, recon.reconstruct(noisy, VIEWS, "fbp").volume.data)
     seen: list[int] = []
     chosen = build(by_name(method), {"iterations": iterations})
-    result = recon.reconstruct(noisy, VIEWS, chosen, control=RunControl(on_progress=lambda p: seen.append(p.step)))
+    result = recon.reconstruct(
+        noisy, VIEWS, chosen, control=RunControl(on_progress=lambda p: p.unit or seen.append(p.step))
+    )
     assert psnr(truth, result.volume.data) > baseline + margin
     assert seen == list(range(1, iterations + 1)) and result.history[-1].residual < 0.2
     assert result.gaussians is None and result.settings["iterations"] == iterations
@@ -308,3 +311,28 @@ def test_a_helical_scan_is_a_height_a_view(method: recon.Method) -> None:
     views = recon.Projector(helix, grid).forward(truth)
     found, smeared = (psnr(truth, recon.reconstruct(views, g, method, grid=grid).volume.data) for g in (helix, still))
     assert found > 25 and found > smeared + 10
+
+
+@pytest.mark.parametrize(
+    ("lean", "method", "warned"),
+    [
+        (30.0, recon.FistaTv(iterations=1), True),
+        (30.0, recon.FistaTv(iterations=1, tv_weight=1e-3), False),
+        (30.0, recon.Fbp(), False),
+        (0.5, recon.FistaTv(iterations=1), False),  # half a pixel over the field is 1.8 degrees
+    ],
+)
+def test_a_leaning_axis_asks_for_a_weight_as_no_view_judges_structure_along_it(
+    lean: float, method: recon.Method, warned: bool
+) -> None:
+    angles = np.arange(12) * np.pi / 6
+    geometry = Geometry.parallel(angles, (12, 32), tilt=np.full(12, np.radians(lean)))
+    assert geometry.unseen_cone == pytest.approx(np.radians(lean) if lean > 2 else 0)
+    views = np.zeros((12, 12, 32), np.float32)
+    views[:, 5:8, 12:20] = 1.0
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        recon.reconstruct(views, geometry, method)
+    said = [str(each.message) for each in told if "leans along the beam by 30 degrees" in str(each.message)]
+    assert bool(said) is warned
+    assert all("tv_weight 0.001" in each for each in said)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.features.sweeps.sweep import Scores, SweptSlice
 from beamline.features.sweeps.values import SweptOption
-from beamline.report.figures import DPI, WIDTH, png, show_grey
+from beamline.report.figures import WIDTH, new_figure, png, show_grey
 from beamline.report.metrics import METRICS
 from recon.base.greys import matter_window
 
@@ -28,8 +28,6 @@ def sweep_sheet(
 
     Two options make a grid, the values of the second one side by side.
     """
-    from matplotlib.figure import Figure
-
     across = len(options[1].values) if len(options) > 1 else min(_COLUMNS, len(slices))
     down = -(-len(slices) // across)
     part = _changes_most([each.image for each in slices])
@@ -38,7 +36,7 @@ def sweep_sheet(
     tall, wide = images[0].shape
     height = WIDTH / across * tall / wide + 0.42
     curve = _CURVE if scores is not None and len(options) == 1 else 0.0
-    figure = Figure(figsize=(WIDTH, curve + height * down + 0.3), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, curve + height * down + 0.3))
     figure.suptitle(title, fontsize=9)
     panels = figure.add_gridspec(1 + down, across, height_ratios=[max(curve, 0.01), *[height] * down])
     if scores is not None and curve:

@@ -11,7 +11,7 @@ import numpy as np
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.projections.scan_statistics import dose_scale
-from beamline.report.figures import DPI, WIDTH, png
+from beamline.report.figures import WIDTH, new_figure, one_panel, png
 from recon.methods import names
 
 if TYPE_CHECKING:
@@ -44,10 +44,7 @@ def pareto_plot(
         unit: of the cost.
         pick: number in `front` of the trial that is worth its cost, which gets a ring; None: of none.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, 5.2 + 0.18 * len(front)), dpi=DPI, layout="constrained")
-    axes: Axes = figure.subplots()
+    figure, axes = one_panel(5.2 + 0.18 * len(front))
     shown = [(t, c, q) for t, c, q in points if math.isfinite(c) and math.isfinite(q)]
     named = {id(points[i]) for i in front}
     for point in points:
@@ -99,10 +96,7 @@ def _number(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
 
 def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
     """The residual of each trial during its run, dB against s: solid for views held out, dashed for views used."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, 4.0), dpi=DPI, layout="constrained")
-    axes: Axes = figure.subplots()
+    figure, axes = one_panel(4.0)
     for outcome in outcomes:
         seconds, quality = np.array(outcome.curve).T
         axes.plot(
@@ -163,12 +157,10 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
     Args:
         values: of a row, by the label of their axis.
     """
-    from matplotlib.figure import Figure
-
     rows = list(dict.fromkeys(outcome.trial.choice.label for outcome in table.compared if outcome.trial.choice))
     down = -(-len(values) // 2)
     height = 2.0 * down + 2.2
-    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
+    figure = new_figure((WIDTH, height), constrained=False)
     panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
     figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
     for axes, (label, value) in zip(panels, values.items(), strict=False):
@@ -185,9 +177,7 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
 
 def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
     """A figure of all rows against dose and against time, a colour a method."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
+    figure = new_figure((WIDTH, 3.6))
     by_dose, by_time = figure.subplots(1, 2, sharey=True)
     a_frame, dose = dose_scale(table.light)
     for method, pairs in _by_method(table, value).items():

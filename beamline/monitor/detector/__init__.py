@@ -1,4 +1,4 @@
-"""What is wrong with a frame by the detector: bands, blur, gain, zingers."""
+"""Checks for faults of the detector: bands, blur, gain, zingers."""
 
 from __future__ import annotations
 

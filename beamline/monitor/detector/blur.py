@@ -114,7 +114,7 @@ class BlurCheck:
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
-    """The ratio of fine to coarse contrast, along rows and along columns; NaN for frames without contrast.
+    """Ratio of fine to coarse contrast, along rows and along columns; NaN without contrast.
 
     Args:
         lines: counts [line, col] of strips of `STRIP` neighbouring rows; `dark` and `flat` likewise.

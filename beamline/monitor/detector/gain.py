@@ -23,7 +23,7 @@ ALIKE = 0.5  # allowed difference between parts, as a share of the gain: a ghost
 
 @dataclass(frozen=True)
 class GainState:
-    """`usual`: changes of the light between views."""
+    """Usual changes of the light between views."""
 
     usual: FrameScatter = field(default_factory=FrameScatter)
 

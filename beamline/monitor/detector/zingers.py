@@ -1,4 +1,4 @@
-"""Zingers: bright spots of a view that no other frame has."""
+"""Zingers: bright spots that only one view has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in views beside the sample: fog, crumbs far from the axis, and what a reconstruction does not explain."""
+"""Checks for objects beside the sample: fog, crumbs far from the axis, and what a reconstruction does not explain."""
 
 from __future__ import annotations
 

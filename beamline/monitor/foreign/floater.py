@@ -1,4 +1,4 @@
-"""Floater: a crumb that crosses the field in some views, on a way that nothing in the turning sample takes.
+"""Floater: a crumb that crosses the field in some views, on a path that no point of the turning sample takes.
 
 Its track is found by the sum over all views that show it (`track`), and held against the sample: a point of it moves on
 a sinusoid about the axis, no farther from it than the sample reaches. A crumb absorbs the same in every view; edges and
@@ -41,7 +41,7 @@ HIGHEST = 8  # cells above and below the track in which its rows are sought
 
 @dataclass(frozen=True, eq=False)
 class SeenCrumb:
-    """A crumb that was found.
+    """A crumb that was detected, with its track.
 
     Attributes:
         first, last: rows in the file of the views that show it, so far.

@@ -29,7 +29,7 @@ EXTENT = 0.5  # of the limit, above which a cell belongs to the region
 
 @dataclass(frozen=True, eq=False)
 class ModelState:
-    """Views so far, and the usual square of the difference at each cell, None before the first."""
+    """Number of views so far, and the usual squared difference of each cell; None before the first view."""
 
     views: int = 0
     usual: CellValues | None = None

@@ -1,4 +1,4 @@
-"""Track: the way of a small absorber through the field, found by the sum over all views that show it.
+"""Track: the path of a small absorber through the field, found by the sum over all views that show it.
 
 Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
 along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
@@ -105,7 +105,7 @@ class SampleMotion(NamedTuple):
 
 
 class Track(NamedTuple):
-    """A way through the field that ends in one of an octave's newest steps.
+    """A path through the field that ends in one of an octave's newest steps.
 
     Attributes:
         score: sum of the changes along it, in standard deviations of that sum.

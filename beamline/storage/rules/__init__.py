@@ -1,1 +1,1 @@
-"""Rules that readers of scan files rely on, and what a file breaks of them."""
+"""Rules that readers of scan files rely on, and findings where a file violates them."""

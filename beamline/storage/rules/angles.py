@@ -109,7 +109,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
+    """Largest gap in degrees of half a turn without a view, beyond the spacing of the views [view] in rad.
 
     Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
     distributed length, whose mean is that of all gaps (Rényi 1953); one scan in a thousand (of ten views: in a hundred)
@@ -154,7 +154,7 @@ class CoarseViews:
     rows: NDArray[np.int64]
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """[row, col] of a view."""
+        """Line integrals [row, col] of a view."""
         cells = reference_frame(self.source, row).cells
         assert cells is not None
         if self.light.dark is None or self.light.flat is None:
@@ -165,7 +165,7 @@ class CoarseViews:
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
     def lit(self, row: int) -> bool:
-        """The view has light, and shows something."""
+        """Whether the view has light and shows a sample."""
         known = reference_frame(self.source, row).cells
         if known is None or self.light.dark is None or self.light.flat is None:
             return bool(np.ptp(self.depth(row)))

@@ -86,7 +86,7 @@ def _dark_levels(source: ScanSource, seen: LookAtRow) -> tuple[Darks, Darks]:
 
 
 def one_energy(source: ScanSource) -> Iterator[Finding]:
-    """The views were taken at one energy: a volume has one."""
+    """All views were taken at one energy, because a volume has one."""
     if (energies := source.energies) is None:
         return
     of_views = energies[source.image_key == FrameKind.PROJECTION]

@@ -97,7 +97,7 @@ def light_beside_flats(
 
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
-    """Sentences on what would explain that views and flats differ by a factor."""
+    """Sentences on possible causes of a factor between views and flats."""
     views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     flats = np.concatenate(groups.flats)
     seen, flat, dark = (_mean(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))

@@ -31,7 +31,7 @@ _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans hav
 
 
 def scan_findings(source: ScanSource) -> list[Finding]:
-    """What the rules of this module find in an open scan."""
+    """Findings of the rules of this module on an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
 
 
@@ -67,7 +67,7 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
 
 
 def quantity_stated(source: ScanSource) -> Iterator[Finding]:
-    """It is known what a pixel means: a forgotten or a second logarithm ruins a volume without a sign."""
+    """The quantity of the pixels is known: a forgotten or a second logarithm ruins a volume without a sign."""
     if source.quantity == "unknown":
         note = source.attributes.get("quantity")
         note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
@@ -207,14 +207,14 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def stated_used(source: ScanSource) -> Iterator[Finding]:
-    """What the file states is used, or named: as a warning where it may change the volume."""
+    """All that the file states is used, or reported: as a warning if it may change the volume."""
     for field in source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
         yield Finding("warning" if field.doubt else "info", "not-used", message)
 
 
 def pixels_square(source: ScanSource) -> Iterator[Finding]:
-    """Pixels are as high as wide, or each row is a slice of its own."""
+    """Pixels are square, or each row is a slice of its own."""
     width, height = source.pixel_size_mm, source.row_pitch_mm
     if height is None:
         return
@@ -239,7 +239,7 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
 
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
-    """A part of a scan that was resumed is not all of it."""
+    """The file is not a single part of a resumed scan."""
     if source.part_starts.size > 1:
         return
     if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):

@@ -56,7 +56,7 @@ class Treatment:
 
 
 def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
-    """What `beamline recon` does with these views, whose frames have this shape, unless it ignores flags.
+    """Treatment of these views, whose frames have this shape, by `beamline recon` unless it ignores flags.
 
     A view in which the sample jumped is as good as those after it. Flags of views from opposite sides for the same jump
     then do not count.
@@ -72,7 +72,7 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
 
 
 def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
-    """[frame]: it is flagged, and every flag is of a part of it."""
+    """Whether each frame [frame] is flagged, and only in parts."""
     whole = np.zeros(flags.bits.size, np.bool_)
     if flags.regions is None:
         return whole

@@ -38,7 +38,7 @@ class ViewLight:
 
     @classmethod
     def of(cls, source: ScanSource, used: ReferenceGroups | None) -> ViewLight:
-        """By these darks and flats, and some views; None: the scan holds line integrals."""
+        """The light by these darks and flats, and some views; None if the scan holds line integrals."""
         views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
         if used is None:
             return cls(source, None, None, 1.0)
@@ -66,7 +66,7 @@ class ViewLight:
         return uniform | dim
 
     def unlit(self, frame: int) -> bool:
-        """A whole view has no light, or is of one value where the flats are not."""
+        """Whether a whole view has no light, or one value where the flats vary."""
         if frame not in self.known:
             self.known[frame] = not self._unlit(frame)
         return not self.known[frame]

@@ -85,7 +85,7 @@ class VolumeFormat(Protocol):
     def name(self) -> str: ...
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """Endings of a file's name; "" for a folder."""
+        """Suffixes of a file's name; "" for a folder."""
 
     @property
     def greys(self) -> bool:
@@ -95,7 +95,7 @@ class VolumeFormat(Protocol):
         """Write a new file, slice by slice. OSError where the disk refuses."""
 
     def holds(self, path: Path) -> bool:
-        """Whether this is a volume in this format, written by this program; False for what cannot be read."""
+        """Whether the file is a volume in this format, written by this program; False if it cannot be read."""
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
         """The record of such a file; its volume's data are read where they are sliced along z.
@@ -128,7 +128,7 @@ class VolumeScale(Protocol):
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
-    """What a file without places of its own says of its volume, for JSON: all but arrays and the history."""
+    """Facts of a volume as JSON, for formats without fields of their own: all but arrays and the history."""
     grid = record.volume.grid
     scalars = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}
     return {
@@ -184,7 +184,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         )
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise DataError(
-            f"{path} does not say what a volume of this program says ({type(error).__name__}: {error}): it was changed."
+            f"{path} lacks facts that volumes of this program have ({type(error).__name__}: {error}): it was changed."
         ) from error
 
 
@@ -192,7 +192,7 @@ def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | N
     """The record of a volume without other facts; `spacing` (z, y, x) in mm."""
     dz, dy, dx = spacing or (1.0, 1.0, 1.0)
     if 0 in values.shape:
-        raise DataError(f"{path} holds no voxel: its shape is {values.shape}; expected [z, y, x].")
+        raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")
     if not math.isclose(dy, dx, rel_tol=1e-3):
         raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")
     return ReconRecord(

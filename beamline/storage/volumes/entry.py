@@ -1,4 +1,4 @@
-"""FormatEntry: where a format of volumes is, and how its files are named."""
+"""FormatEntry: the module of a format of volumes, and the suffixes of its files."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def format_of(path: Path) -> VolumeFormat:
     """
     suffix = path.suffix.lower()
     if not path.name or (not suffix and path.name.startswith(".")):
-        raise ValueError(f"{str(path)!r} names no file and no folder for a volume; expected such as volume.h5.")
+        raise ValueError(f"{str(path)!r} is not the name of a volume; expected one such as volume.h5.")
     kind_of_file = next((kind for kind in formats() if suffix in kind.suffixes), None)
     if kind_of_file is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
@@ -126,7 +126,7 @@ def whole_volume(
 
 
 def times_of(path: Path) -> tuple[float, ...]:
-    """When each of several volumes in time was, s from the first view on; empty where a file holds no such series."""
+    """Time of each of several volumes, in s from the first view on; empty if the file has no such series."""
     if not NXtomoproc().holds(path):
         return ()
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

@@ -55,7 +55,7 @@ class NexusVolume:
     greys: bool = False
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
-        raise ValueError(f"{self.name} is read alone; write {NXtomoproc().name}.")
+        raise ValueError(f"{self.name} can only be read; write {NXtomoproc().name}.")
 
     def holds(self, path: Path) -> bool:
         if not path.is_file() or not hdf5.is_hdf5(path):

@@ -70,7 +70,7 @@ class Nrrd:
 
 @dataclass(frozen=True)
 class Npy:
-    """NumPy's own format: the voxels and their shape, and nothing else."""
+    """NumPy's own format: only the voxels and their shape."""
 
     name: str = "npy"
     suffixes: tuple[str, ...] = REGISTRY["npy"].suffixes
@@ -84,7 +84,7 @@ class Npy:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        """Any that has three axes of numbers."""
+        """Whether the file has three axes of numbers."""
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:

@@ -60,7 +60,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         DataError: there is none, the file is something else, or damaged: its content differs from its digest.
     """
     if not path.is_file():
-        raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
+        raise DataError(f"{path} is not there; name a checkpoint of recon --checkpoint.")
     try:
         with opened_whole(path) as file:
             require_harmless(file)

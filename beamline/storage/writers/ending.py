@@ -52,7 +52,7 @@ def state_ending(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanE
 
 
 def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEnding) -> None:
-    """Write status and reason alone, which takes no room on the disk."""
+    """Write only status and reason, which takes no space on the disk."""
     if layout.REASON in datasets:
         datasets[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()
     datasets[layout.STATUS][()] = ending.status.encode()

@@ -162,12 +162,12 @@ class NXtomoWriter:
 
     @property
     def rows(self) -> int:
-        """Frames appended."""
+        """Number of frames appended."""
         return self._rows
 
     @property
     def committed(self) -> int:
-        """Frames that are complete in the file, seen by readers and safe from a crash of this process."""
+        """Number of frames that are complete in the file: readers see them, and a crash of this process keeps them."""
         return self._committed
 
     @property
@@ -177,7 +177,7 @@ class NXtomoWriter:
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:
-        """Commit the rows appended so far, whatever `flush_every` says; nothing after a failed write."""
+        """Commit the rows so far, regardless of `flush_every`; does nothing after a failed write."""
         if self._broken:
             return
         self._require_untouched()
@@ -195,7 +195,8 @@ class NXtomoWriter:
         beam: Sequence[BeamReading] = (),
         reason: str = "",
     ) -> None:
-        """Finish: how the scan ended and when, then `finished`, then the /exchange view. Twice is once.
+        """Finish the file: how and when the scan ended, then `finished`, then the /exchange view. A second call does
+        nothing.
 
         After a failed write the file only gets status "failed" and `finished`, and is not closed.
 
@@ -256,7 +257,7 @@ class NXtomoWriter:
         try:
             self._file.close()
             if (head := superblock(self.path)) is None or not head.intact or head.missing:
-                raise _TouchedError(errno.EIO, "it is not as it was written")
+                raise _TouchedError(errno.EIO, "its content was changed")
         except FAILURES:
             self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
             raise

@@ -40,7 +40,7 @@ _MISSING, _ADDING, _DONE = range(3)
 
 @dataclass(frozen=True, eq=False)
 class PartialVolume:
-    """A volume with some finished slabs; nobody else opens it so while this value lives.
+    """A volume with some finished slabs; no other process can add slabs while this value lives.
 
     Attributes:
         slabs: all of them.
@@ -66,7 +66,7 @@ class PartialVolume:
 
     @property
     def n_slices_done(self) -> int:
-        """Slices of the slabs that are finished."""
+        """Number of slices of the finished slabs."""
         return sum(slab.own.stop - slab.own.start for n, slab in enumerate(self.slabs) if self.has(n))
 
     def add(self, n: int, data: NDArray[np.float32] | None) -> None:
@@ -215,7 +215,7 @@ def _put_back(path: Path) -> None:
 
 
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
-    """All slabs, and those that are not finished; undoes a completion that was cut short.
+    """All slabs, and the unfinished ones; undoes a completion that was interrupted.
 
     Raises:
         DataError: as `open_partial`.

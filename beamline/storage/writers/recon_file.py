@@ -1,4 +1,4 @@
-"""Reconstruction files: a volume, everything it was made with and how it grew, as NXtomoproc; all of it or nothing."""
+"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written whole or not at all."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
 
 
 def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> None:
-    """Write the new file `path`, sixteen slices at a time. OSError where the disk refuses.
+    """Write the new file `path`, sixteen slices at a time. OSError on a disk error.
 
     Args:
         empty: without the voxels, for which there is one place, of zeros.
@@ -61,7 +61,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
 
 
 def rewrite_facts(path: Path, record: ReconRecord) -> None:
-    """Replace all but voxels and axes by what `record` says. OSError where the disk refuses."""
+    """Replace all but voxels and axes by the values of `record`. OSError on a disk error."""
     with hdf5.changed(path) as file:
         entry = file["entry"]
         for name in set(entry) - {"data"}:
@@ -185,7 +185,7 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
 
 
 def volumes_in_time(file: h5py.File) -> int:
-    """How many volumes in time a file of ours has; 0: it has one volume alone."""
+    """Number of volumes in time of a file of ours; 0: it has one volume."""
     stored = file["entry/data/data"]
     return int(stored.shape[0]) if stored.ndim == 4 else 0
 
@@ -232,7 +232,7 @@ def _own_value(node: h5py.Dataset) -> Value:
 
 
 def value_of(node: h5py.Dataset, most: float = hdf5.BRIEF) -> Value:
-    """What a dataset of so many bytes at most holds, as plain text or number where it is one."""
+    """Value of a dataset of at most so many bytes, as plain text or number if it is one."""
     value = hdf5.values_of(node, most)
     if isinstance(value, bytes):
         return value.decode()

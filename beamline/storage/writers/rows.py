@@ -1,4 +1,4 @@
-"""Rows of a scan file, one a frame: what is written in each, and whether it still is as it was written."""
+"""Rows of a scan file, one a frame: their content, and whether it is still as it was written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ToDisk: what was flushed is brought to the disk (fsync) beside the work, so that a loss of power cannot take it."""
+"""ToDisk: brings flushed data to the disk (fsync) in a thread, so that a loss of power cannot take them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PATIENCE = 60.0  # s that the last calls may take
 
 
 class ToDisk:
-    """Calls `to_disk` in a thread, one call at a time: so a writer need not wait for the disk.
+    """Calls `to_disk` in a thread, one call at a time, so that a writer need not wait for the disk.
 
     The thread is a daemon: a disk that hangs does not keep the program from ending.
 

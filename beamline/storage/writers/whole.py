@@ -1,4 +1,4 @@
-"""What makes a file of all frames, which were copied or computed, one of a scan that has ended."""
+"""Completion of a file whose frames were copied or computed: it becomes that of a scan that has ended."""
 
 from __future__ import annotations
 

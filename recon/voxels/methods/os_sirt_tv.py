@@ -13,7 +13,7 @@ from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
-from recon.voxels.held_out import choose_weight
+from recon.voxels.held_out import CHOICE_SWEEPS, choose_weight
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
@@ -50,6 +50,11 @@ class OsSirtTv:
 
     def __post_init__(self) -> None:
         check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 0}, least={"tv_weight": 0.0})
+
+    @property
+    def trial_sweeps(self) -> int:
+        """Those for the weight."""
+        return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_iterative(self, problem, control)

@@ -83,7 +83,7 @@ def test_rows_that_replace_each_other_in_a_circle_are_refused(write: Write, fram
     with h5py.File(path, "r+") as file:
         file[layout.REPLACES][ROW] = ROW
         seal(file)  # as if it had been written so
-        with pytest.raises(ValueError, match="row 8 is"):
+        with pytest.raises(ValueError, match="row 8 claims"):
             views_in(file)
     with open_scan(path) as source, pytest.raises(DataError, match="can be replaced"):
         _ = source.replaces

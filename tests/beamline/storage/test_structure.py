@@ -51,7 +51,7 @@ def test_a_scan_that_draws_on_a_pipe(
             file["entry/other"] = h5py.ExternalLink("other.h5", "/")
         else:
             draw(file, "pipe")
-    with pytest.raises(DataError, match=r"draws on .*or a pipe"):
+    with pytest.raises(DataError, match=r"links to .*or a pipe"):
         open_scan(path)
 
 

@@ -80,8 +80,8 @@ def test_nifti_scales_values_and_lengths_as_its_header_says(tmp_path: Path) -> N
     [
         (nifti()[:-1], "cut or damaged .Expected 48 bytes, got 47 bytes"),
         (nifti()[:100], "cut or damaged"),
-        (nifti(magic=b"ni1\0"), "no single-file NIfTI-1"),
-        (nifti(size=540), "no single-file NIfTI-1"),
+        (nifti(magic=b"ni1\0"), "no NIfTI-1 in one file"),
+        (nifti(size=540), "no NIfTI-1 in one file"),
         (nifti(datatype=128, bitpix=24), "type 128 with 24 bits"),
         (nifti(bitpix=8), "type 4 with 8 bits"),
         (nifti(dim=(2, 4, 3, 2, 1, 1, 1, 1)), "a volume has three"),

@@ -123,10 +123,10 @@ def test_a_digest_tells_a_changed_byte(at: int) -> None:
 
 
 KERNELS = """
+import os
 import warnings
-import numpy as np
-from numba import njit
 import recon.compiled
+from numba import njit
 
 @njit(cache=True)
 def scaled(x):
@@ -135,6 +135,7 @@ def scaled(x):
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     assert scaled(3.0) == 6.0 and scaled(3) == 6
+assert "NUMBA_CACHE_LOCATOR_CLASSES" not in os.environ
 print(sum(scaled.stats.cache_misses.values()), len(told), *(str(each.message) for each in told))
 """
 

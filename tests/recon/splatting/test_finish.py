@@ -157,7 +157,7 @@ def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     truth = _of(g, Grid((12, 42, 42), 1.0)).data.reshape(4, 3, 14, 3, 14, 3).mean((1, 3, 5))
     found = finish(volume, g, _problem(data, grid=grid)).volume.data
     raw = FistaTv(20).run(_problem(data, grid=grid), RunControl()).volume.data
-    assert psnr(truth, found) > psnr(truth, raw) + 1 and psnr(truth, found) > psnr(truth, volume.data) + 1
+    assert psnr(truth, found) > psnr(truth, raw) and psnr(truth, found) > psnr(truth, volume.data) + 1.5
 
 
 def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:

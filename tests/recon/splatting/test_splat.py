@@ -19,7 +19,7 @@ from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.splat import project, voxelize
+from recon.splatting.splat import project, voxel_means, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double
 
@@ -316,3 +316,19 @@ def test_extreme_gaussians_stay_finite(
 def test_the_cpu_kernel_refuses_doubles(random_gaussians: Make) -> None:
     with pytest.raises(ValueError, match="float32"):
         project(in_double(random_gaussians(2)), geometry(), implementation="cpu")
+
+
+def test_voxel_means_are_those_of_finer_voxels() -> None:
+    """Of voxels of two pixels; Gaussians that were fitted to views without a width hold the mean over a pixel."""
+    g = Gaussians.from_physical(
+        [[0.3, -0.2, 0.1], [-1.2, 0.9, -0.4]], [[0.7, 1.1, 0.9], [0.8, 0.6, 1.0]], [1.0, 0.6],
+        quaternions=[[1.0, 0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]],
+    )  # fmt: skip
+    grid, views = Grid((6, 6, 6), 1.4), Geometry.parallel([0.0], (12, 12), pixel_pitch=0.7)
+    means = voxelize(g, Grid((48, 48, 48), 1.4 / 8)).numpy().reshape(6, 8, 6, 8, 6, 8).mean((1, 3, 5))
+    with_width = voxel_means(g, grid, views.seen_with(RayWidth(pixel=1))).numpy()
+    at_centres, found = voxelize(g, grid).numpy(), voxel_means(g.widened(0.7**2 / 12), grid, views).numpy()
+    assert np.abs(with_width - means).max() < 0.1 * np.abs(at_centres - means).max()
+    np.testing.assert_allclose(found, with_width, atol=1e-5)
+    fine = Grid((12, 12, 12), 0.7)
+    np.testing.assert_array_equal(voxel_means(g, fine, views).numpy(), voxelize(g, fine).numpy())

@@ -124,7 +124,7 @@ class _Scale:
 def _opened(path: Path, name: str) -> _Chunks:
     metadata = json.loads(bytes_below(path, f"{name}/{_META}", SETTINGS))
     if (codecs := [str(each["name"]) for each in metadata["codecs"]]) != ["bytes"]:
-        raise ValueError(f"its chunks are encoded by {', '.join(codecs)}, and only plain ones are read")
+        raise ValueError(f"its chunks are encoded by {', '.join(codecs)}, but only raw ones are read")
     chunk = shape_of(metadata["chunk_grid"]["configuration"]["chunk_shape"], "chunk")
     return _Chunks(path, name, shape_of(metadata["shape"]), chunk, dtype_of(metadata["data_type"]))
 

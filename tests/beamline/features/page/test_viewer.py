@@ -216,7 +216,7 @@ def test_a_histogram_of_a_range_beyond_float32(tmp_path: Path) -> None:
 
 def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "v.npy", np.ones((0, 3, 3), np.float32))
-    with pytest.raises(DataError, match="holds no voxel"):
+    with pytest.raises(DataError, match="has no voxels"):
         ShownVolume(tmp_path / "v.npy")
     (tmp_path / "v.h5").write_text("no volume")
     with pytest.raises(DataError):

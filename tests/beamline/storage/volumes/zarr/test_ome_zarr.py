@@ -79,7 +79,7 @@ def test_one_of_ours_that_was_compressed_is_refused_with_what_is_read(tmp_path: 
     said = (tmp_path / "v.zarr/0/zarr.json").read_text()
     (tmp_path / "v.zarr/0/zarr.json").write_text(said.replace('"codecs": [', '"codecs": [{"name": "blosc"}, '))
     with (
-        pytest.raises(DataError, match="only plain ones"),
+        pytest.raises(DataError, match="only raw ones"),
         opened_volume(tmp_path / "v.zarr"),
     ):
         pass
