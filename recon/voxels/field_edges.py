@@ -39,24 +39,24 @@ class FieldEdges:
         cut near the axis on purpose; the other half turn sees what is there.
 
         Args:
-            data: line integrals [view, row, col].
+            data: line integrals [view, row, col]; values that are not finite do not count.
         """
         n, cols = len(data), data.shape[2]
         width = max(2, cols // 50)
         if n == 0 or cols < 2 * width:
             return cls({}, 0.0)
         some = data[np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))]
-        mass = np.maximum(some.mean(axis=(0, 2)), 0)
+        mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
         some = some[:, mass >= _FULL * mass.max()]
         edges = {"left": some[..., :width], "right": some[..., -width:]}
         if geometry.is_off_middle and covers_the_circle(geometry.angles):
             far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
             edges = {far: edges[far]}
         levels = {
-            side: min(float(np.median(part)) for part in np.array_split(values, min(_PARTS, len(values))))
+            side: min(_median(part) for part in np.array_split(values, min(_PARTS, len(values))))
             for side, values in edges.items()
         }
-        return cls(levels, float(np.median(some.mean(axis=(1, 2)))))
+        return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))))
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
         """The edges beyond which the sample goes on, with their line integrals; empty where it is in the field.
@@ -65,6 +65,12 @@ class FieldEdges:
             least: line integral that a beam which changes may leave; 0 of views whose air is at zero.
         """
         return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
+
+
+def _median(values: F32) -> float:
+    """Of the rays that were measured; 0 where none was."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def wider_than_field(projections: F32, geometry: Geometry) -> bool:
