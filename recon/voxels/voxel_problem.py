@@ -161,7 +161,6 @@ def iterative_memory(
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
     wide = max(geometry.detector_shape[1], grid.shape[2])
     volumes += geometry.width.arc > 0  # of the moments of an exposure
-    resolution = Resolution.of(geometry, grid)
-    rays += bool(resolution.sharpened.any()) + bool(resolution.smoothed.any())
+    rays += bool(geometry.width) + bool(Resolution.of(geometry, grid).smoothed.any())
     beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside

@@ -318,7 +318,7 @@ print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1,
     for wrong, says in (
         ("{}", "needs psnr_gain_per_10_views or psnr_loss"),
         ("{psnr_loss: 0}", "expected a number > 0"),
-        ("{psnr_loss: 0.5}", "fbp has none, r2 has"),
+        ("{psnr_loss: 0.5}", "as r2; got fbp"),
     ):
         with pytest.raises(ConfigError, match=says):
             small("recon.live=true", "recon.method=fbp", f"recon.stop_when={wrong}")
