@@ -125,7 +125,7 @@ def play(name: str, case: Case) -> list[Score]:
     """One competitor on one case, by each setting."""
     competitor, share = LEAGUE[name], 1.0
     rows = case.geometry.detector_shape[0]
-    if competitor.slice_by_slice and rows > SLICES:
+    if competitor.slice_by_slice and not case.geometry.is_cone and rows > SLICES:
         case, share = rows_of(case, [rows * (2 * k + 1) // (2 * SLICES) for k in range(SLICES)]), rows / SLICES
     competitor.prepare(case)
     scores: list[Score] = []
@@ -148,6 +148,11 @@ def _child(name: str, path: Path) -> list[Score]:
     return play(name, pickle.loads(path.read_bytes()))  # noqa: S301 - written by the parent
 
 
+def _cell(score: Score) -> str:
+    seconds = f"{score.seconds:.0f}" if score.seconds >= 10 else f"{score.seconds:.2g}"
+    return f"{score.quality:.2f}, {seconds} s"
+
+
 def table(scores: dict[str, dict[str, list[Score]]]) -> str:
     """Markdown: a competitor by default, and below it by its best setting; the memory is the largest of all scans."""
     scans = list(scores)
@@ -157,11 +162,11 @@ def table(scores: dict[str, dict[str, list[Score]]]) -> str:
         if not any(rows):
             continue
         memory = f"{max(score.memory for some in rows for score in some):.0f}"
-        default = [f"{some[0].quality:.2f}, {some[0].seconds:.2g} s" if some else "" for some in rows]
+        default = [_cell(some[0]) if some else "" for some in rows]
         lines.append(f"| {name}, {LEAGUE[name].default} | " + " | ".join(default) + f" | {memory} |")
         if len(LEAGUE[name].settings) > 1:
             best = [max(some, key=lambda score: score.quality) if some else None for some in rows]
-            cells = [f"{one.quality:.2f}, {one.seconds:.2g} s ({one.setting})" if one else "" for one in best]
+            cells = [f"{_cell(one)} ({one.setting})" if one else "" for one in best]
             lines.append(f"| {name}, best | " + " | ".join(cells) + " | |")
     return "\n".join(lines)
 
