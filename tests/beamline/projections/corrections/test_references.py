@@ -85,7 +85,7 @@ def test_a_scan_without_a_good_group_is_refused_and_an_option_overrides(levels: 
 
 
 def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known() -> None:
-    """Flats with 2 % of the light, and nothing wrong with them beside one another: by themselves, or beside the views."""
+    """Flats with 2 % of the light, and nothing wrong with them beside one another: alone, or beside the views."""
     dim = (DARK, DARK + 0.02 * BEAM)
     with pytest.raises(DataError, match=r"flats 3-5, 54-56:.*.limit 50%"):
         prepare_projections(source(dim, dim, 0.05), SELECTION, pytest.fail)  # type: ignore[arg-type]
