@@ -29,7 +29,7 @@ _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
 
-class Ending(Enum):
+class ProcessEnd(Enum):
     """Why a process ended."""
 
     EXITED = auto()
@@ -114,7 +114,7 @@ class ChildProcess:
         seconds: float = math.inf,
         silence: float = math.inf,
         grace: float = 0.0,
-    ) -> Ending:
+    ) -> ProcessEnd:
         """Wait until the process has ended and all its lines have been passed on.
 
         Args:
@@ -125,18 +125,18 @@ class ChildProcess:
             grace: real s between the request to end and the kill; 0 kills at once. One that is frozen has FROZEN_AFTER.
         """
         self._silent_since = time.monotonic()
-        ending, deadline = Ending.EXITED, self._silent_since + seconds
+        ending, deadline = ProcessEnd.EXITED, self._silent_since + seconds
         while self.running:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(max(0.0, min(_POLL, deadline - time.monotonic())))
                 break
             now = time.monotonic()
             if now >= deadline:
-                ending, grace = Ending.OUT_OF_TIME, 0.0
+                ending, grace = ProcessEnd.OUT_OF_TIME, 0.0
             elif stop():
-                ending = Ending.STOPPED
+                ending = ProcessEnd.STOPPED
             elif now - self._silent_since > silence:
-                ending = Ending.SILENT
+                ending = ProcessEnd.SILENT
             else:
                 continue
             self._end(grace, hurry)

@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
-from recon.voxels.resolution import Resolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, as_voxels_see
 
 _RESIDUAL_VIEWS = 16
 RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
@@ -196,7 +196,7 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
 def squares_left(
     projected: NDArray[np.float32],
     views: NDArray[np.float32],
-    resolution: Resolution,
+    resolution: ViewResolution,
     measured: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """[view] squares of A x - p and of p, summed over the rays that were measured, p at the resolution of voxels.
@@ -242,7 +242,7 @@ def _residual(
             grid = replace(volume.grid, shape=(part.detector_shape[0], *volume.grid.shape[1:]), centre=height)
             lines = Volume(np.ascontiguousarray(volume.data[rows]), grid)
         measured = None if weights is None else np.asarray(weights[views, rows] > 0)
-        left, own = squares_left(project(lines, part), data[views, rows], Resolution.of(part, lines.grid), measured)
+        left, own = squares_left(project(lines, part), data[views, rows], ViewResolution.of(part, lines.grid), measured)
         squared, total = squared + left.sum(), total + own.sum()
         progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:

@@ -23,7 +23,7 @@ from beamline.core.events import (
     event_of,
 )
 from beamline.core.machine import free_memory
-from beamline.core.process import ChildProcess, Ending, json_object
+from beamline.core.process import ChildProcess, ProcessEnd, json_object
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import describe
 from beamline.scan.live_plan import LivePlan, live_plan
@@ -195,8 +195,8 @@ class LiveReconstruction:
         ending = process.wait(stop=stop, hurry=hurry, silence=self._silence, grace=_GRACE)
         if self._done is None:
             reasons = {
-                Ending.STOPPED: "it was stopped",
-                Ending.SILENT: f"it was stopped after {self._silence:.0f} s without output",
+                ProcessEnd.STOPPED: "it was stopped",
+                ProcessEnd.SILENT: f"it was stopped after {self._silence:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
             message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."

@@ -92,9 +92,16 @@ def voxel_means(
     A mean over h has the variance h²/12. Gaussians that were fitted to views whose rays have no width hold that of a
     pixel, p²/12, already; so voxels of a pixel take the centres' values.
     """
-    pixel = 0.0 if geometry.width.pixel else geometry.sample_pitch
-    wider = (min(grid.spacing) ** 2 - pixel**2) / 12
-    return voxelize(gaussians.widened(wider), grid, truncation=truncation)
+    pixel, edge = 0.0 if geometry.width.pixel else geometry.sample_pitch, min(grid.spacing)
+    parts = max(1, math.ceil(edge / (2 * geometry.sample_pitch)))  # of a coarse voxel's edge, whose box is no Gaussian
+    nz, ny, nx = (parts * n for n in grid.shape)
+    slices = None if grid.slice_pitch is None else grid.slice_pitch / parts
+    fine = Grid((nz, ny, nx), grid.voxel_size / parts, grid.centre, slices)
+    density = voxelize(gaussians.widened(((edge / parts) ** 2 - pixel**2) / 12), fine, truncation=truncation)
+    if parts == 1:
+        return density
+    z, y, x = grid.shape
+    return density.reshape(z, parts, y, parts, x, parts).mean(dim=(1, 3, 5))
 
 
 def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:

@@ -24,7 +24,7 @@ from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, as_voxels_see
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -57,7 +57,7 @@ def beyond_chance(gains: F64, errors: float) -> bool:
     return float(gains.mean()) > errors * scatter
 
 
-def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: Resolution) -> F64:
+def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
     """[view] root mean square of what a volume leaves of each view, at the resolution of voxels.
 
     The truth leaves the noise alone, by that; of views as measured it would leave more than a sharper volume does.

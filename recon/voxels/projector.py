@@ -33,7 +33,7 @@ from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 from recon.kernels.cpu.spread import spread
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.resolution import Resolution, levels, on_rows
+from recon.voxels.resolution import ViewResolution, levels, on_rows
 
 _TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
@@ -63,7 +63,7 @@ class Projector:
     geometry: Geometry
     grid: Grid
     matched: bool = True
-    resolution: Resolution = field(init=False, repr=False)
+    resolution: ViewResolution = field(init=False, repr=False)
     _sharpened: NDArray[np.float64] | None = field(init=False, repr=False)
     _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
@@ -81,7 +81,7 @@ class Projector:
             for band, views in bands_of(self.geometry, self.grid)
         ]
         object.__setattr__(self, "_bands", found)
-        object.__setattr__(self, "resolution", Resolution.of(self.geometry, self.grid))
+        object.__setattr__(self, "resolution", ViewResolution.of(self.geometry, self.grid))
         sharpened = self.resolution.sharpened
         if not self.matched:
             sharpened = np.minimum(sharpened, 0)
@@ -204,7 +204,7 @@ class Projector:
             joseph_cpu.adjoint(projections, *rays[:2], out)
 
     def _spread(self, lines: F32) -> F32:
-        """Lines [view, col, row] at the resolution of the views, see `Resolution`; its own transpose."""
+        """Lines [view, col, row] at the resolution of the views, see `ViewResolution`; its own transpose."""
         if self._sharpened is None:
             return lines
         return spread(lines, -self._sharpened[:, 0], -self._sharpened[:, 1])

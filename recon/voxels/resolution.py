@@ -34,7 +34,7 @@ _PAD = 16  # px beyond the edges of views, to which the outer ones are repeated
 
 
 @dataclass(frozen=True, eq=False)
-class Resolution:
+class ViewResolution:
     """The blur of line integrals through voxels, beside that of the views, along (columns, rows) of each view.
 
     Attributes:
@@ -52,7 +52,7 @@ class Resolution:
     of_rows: bool
 
     @classmethod
-    def of(cls, geometry: Geometry, grid: Grid) -> Resolution:
+    def of(cls, geometry: Geometry, grid: Grid) -> ViewResolution:
         axes = _axes(geometry)
         middle = np.array(grid.centre[::-1]) - geometry.centres
         pitch = np.full(geometry.n_views, geometry.pixel_pitch)
@@ -64,7 +64,7 @@ class Resolution:
         views = (width.pixel or 1.0) ** 2 / 12, width.blur**2
         return cls(np.abs(axes[:, :2]) * edges[:, None], interpolation, views, geometry.is_cone)
 
-    def select(self, views: NDArray[np.intp]) -> Resolution:
+    def select(self, views: NDArray[np.intp]) -> ViewResolution:
         """Of these views, in their order."""
         return replace(self, voxels=self.voxels[views], interpolation=self.interpolation[views])
 
@@ -115,7 +115,7 @@ def levels(geometry: Geometry, grid: Grid) -> tuple[F64, float]:
 
 
 def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
-    """`Resolution.interpolation`; `axes`: those of the views."""
+    """`ViewResolution.interpolation`; `axes`: those of the views."""
     (columns, rows, beam), views = axes.swapaxes(0, 1), np.arange(geometry.n_views)
     run = np.abs(beam)
     across = np.where(run[:, 1] >= run[:, 0], 1, 0)  # the planes that sample a ray
@@ -140,7 +140,7 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     return np.where(still & (found > 0), np.round(d * (1 - d), _DIGITS), found)
 
 
-def as_voxels_see(views: F32, resolution: Resolution, counts: NDArray[np.bool_] | None = None) -> F32:
+def as_voxels_see(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
     """Views [view, col, row] at the resolution of projections of a volume by the model; only rays that count have part.
 
     A ray that does not count, or has few beside it that do, keeps its value.
@@ -168,7 +168,7 @@ def _filtered(views: F32, filters: list[F64]) -> F32:
     return np.ascontiguousarray(found, np.float32)
 
 
-def smoothed(views: F32, resolution: Resolution, counts: NDArray[np.bool_] | None = None) -> F32:
+def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
     """Views [view, col, row] without what voxels are too coarse for; the same array where they are not.
 
     Rays that do not count have no part.

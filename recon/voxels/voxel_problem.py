@@ -18,7 +18,7 @@ from recon.kernels.cpu.vectors import extrapolate, replace_by_residual, turn_of_
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
-from recon.voxels.resolution import Resolution
+from recon.voxels.resolution import ViewResolution
 from recon.voxels.sweeps import Sweeps
 
 POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
@@ -161,6 +161,6 @@ def iterative_memory(
     n_rays = geometry.n_views * math.prod(geometry.detector_shape)
     wide = max(geometry.detector_shape[1], grid.shape[2])
     volumes += geometry.width.arc > 0  # of the moments of an exposure
-    rays += bool(geometry.width) + bool(Resolution.of(geometry, grid).smoothed.any())
+    rays += bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
     beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside

@@ -30,7 +30,7 @@ from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution
+from recon.voxels.resolution import ViewResolution
 
 _FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
@@ -53,7 +53,7 @@ class SweptSlice:
     seconds: float
     views: HeldOutViews
     projected: F32
-    resolution: Resolution
+    resolution: ViewResolution
 
     @property
     def label(self) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
-from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
+from beamline.core.process import ChildProcess, ProcessEnd, json_object, last_line, with_our_path
 from beamline.features.trials.trial import Outcome, Status, Trial
 
 DATA = "data"
@@ -101,7 +101,7 @@ def _run(job: TrialJob, work: Path, max_seconds: float | None = None) -> _Ended:
         ChildProcess(command(path), stderr, remember, with_our_path(), tether=True) as process,
     ):
         ending = process.wait(seconds=math.inf if max_seconds is None else max_seconds)
-    return _Ended(last, process.code, last_line(log), ending is Ending.OUT_OF_TIME)
+    return _Ended(last, process.code, last_line(log), ending is ProcessEnd.OUT_OF_TIME)
 
 
 def _outcome(trial: Trial, ended: _Ended) -> Outcome:

@@ -45,7 +45,7 @@ from recon.base.volume import Grid, Volume
 from recon.features.trials.fsc import fourier_shell_correlation, soft_cylinder
 from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
-from recon.voxels.resolution import Resolution
+from recon.voxels.resolution import ViewResolution
 from recon.warm_up import warm_up
 
 Say = Callable[[Mapping[str, Any]], None]
@@ -132,7 +132,7 @@ def measured(
         left, own = squares_left(
             shown(volume_at, of_view, geometry, grid),
             unseen,
-            Resolution.of(geometry, grid),
+            ViewResolution.of(geometry, grid),
             None if rays is None else np.asarray(rays > 0),
         )
         if not own.any():

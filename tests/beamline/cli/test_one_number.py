@@ -22,7 +22,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution
+from recon.voxels.resolution import ViewResolution
 from tests.beamline.array_source import ArraySource
 from tests.beamline.cli.small_scan import SCAN, beamline
 from tests.beamline.scans import write_exchange
@@ -116,7 +116,7 @@ def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
     sweep = pytest.importorskip(SWEEP)
     views = sweep.HeldOutViews(np.arange(4), np.ones((4, 2, 8), np.float32), None)  # type: ignore[arg-type]
     image, views_at = np.zeros((8, 8), np.float32), Geometry.parallel(np.arange(4.0), (2, 8))
-    even = Resolution.of(views_at, Grid.matching(views_at))
+    even = ViewResolution.of(views_at, Grid.matching(views_at))
 
     def leaving(share: float) -> object:
         return sweep.SweptSlice(

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from beamline.core import process as module
-from beamline.core.process import ChildProcess, Ending, json_object
+from beamline.core.process import ChildProcess, ProcessEnd, json_object
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 
@@ -68,14 +68,14 @@ class _Child:
 
 def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
     child = _Child(tmp_path, "import sys; print(1); print(2); sys.exit('no room')")
-    assert child.process.wait() is Ending.EXITED
+    assert child.process.wait() is ProcessEnd.EXITED
     assert (child.lines, child.process.code, child.process.running) == (["1", "2"], 1, False)
     assert child.log.read_text(encoding="utf-8").strip() == "no room"
 
 
 def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
-    assert child.process.wait(seconds=0.5, grace=100.0) is Ending.OUT_OF_TIME
+    assert child.process.wait(seconds=0.5, grace=100.0) is ProcessEnd.OUT_OF_TIME
     assert 0.5 <= time.monotonic() - begin < 30.0
     assert not child.process.running
 
@@ -83,7 +83,7 @@ def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
 @posix
 def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
     child = _Child(tmp_path, DELIVERS)
-    assert child.process.wait(stop=child.begun, grace=30.0) is Ending.STOPPED
+    assert child.process.wait(stop=child.begun, grace=30.0) is ProcessEnd.STOPPED
     assert (child.lines, child.process.code) == (["begun", "delivered"], 4)
 
 
@@ -91,7 +91,7 @@ def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("grace", "hurry"), [(0.5, False), (100.0, True)])
 def test_a_process_that_does_not_end_is_killed(tmp_path: Path, grace: float, hurry: bool) -> None:
     child, begin = _Child(tmp_path, IGNORES), time.monotonic()
-    assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is Ending.STOPPED
+    assert child.process.wait(stop=child.begun, hurry=lambda: hurry, grace=grace) is ProcessEnd.STOPPED
     assert time.monotonic() - begin < 30.0
     assert child.process.code != 0
 
@@ -105,19 +105,19 @@ def test_a_process_that_is_frozen_is_not_waited_for_and_one_that_works_in_silenc
     while not frozen.begun():
         time.sleep(0.01)
     psutil.Process(frozen.process._process.pid).suspend()
-    assert frozen.process.wait(stop=frozen.begun, grace=100.0) is Ending.STOPPED
+    assert frozen.process.wait(stop=frozen.begun, grace=100.0) is ProcessEnd.STOPPED
     assert 1.5 <= time.monotonic() - begin < 30.0 and frozen.lines == ["begun"]
     works = _Child(tmp_path, WORKS)
-    assert works.process.wait(stop=works.begun, grace=100.0) is Ending.STOPPED
+    assert works.process.wait(stop=works.begun, grace=100.0) is ProcessEnd.STOPPED
     assert (works.lines, works.process.code) == (["begun", "delivered"], 4)
 
 
 def test_a_silent_process_is_ended_and_one_that_writes_is_not(tmp_path: Path) -> None:
-    assert _Child(tmp_path, SLEEPS).process.wait(silence=0.5) is Ending.SILENT
+    assert _Child(tmp_path, SLEEPS).process.wait(silence=0.5) is ProcessEnd.SILENT
     chatter = _Child(tmp_path, CHATTERS)
     while not chatter.begun():  # the start of an interpreter is silent, too
         time.sleep(0.01)
-    assert chatter.process.wait(silence=0.5) is Ending.EXITED
+    assert chatter.process.wait(silence=0.5) is ProcessEnd.EXITED
     assert len(chatter.lines) == 8
 
 
@@ -125,7 +125,7 @@ def test_silence_counts_from_the_wait(tmp_path: Path) -> None:
     """Nobody waits for a process during a scan: it may be silent for as long as the scan takes."""
     child = _Child(tmp_path, "import time; time.sleep(1.0)")
     time.sleep(0.7)
-    assert child.process.wait(silence=0.6) is Ending.EXITED
+    assert child.process.wait(silence=0.6) is ProcessEnd.EXITED
 
 
 def test_leaving_the_context_kills_the_process(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ os._exit(0)
 
 def test_the_end_of_a_process_that_is_tethered_leaves_no_open_pipe(tmp_path: Path) -> None:
     child = _Child(tmp_path, "import sys; print(sys.stdin.readline() == '')", tether=True)
-    assert child.process.wait(seconds=0.5) is Ending.OUT_OF_TIME  # stdin is open as long as we live
+    assert child.process.wait(seconds=0.5) is ProcessEnd.OUT_OF_TIME  # stdin is open as long as we live
     assert child.lines == []
 
 

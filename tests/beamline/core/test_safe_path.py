@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from beamline.config.load import config_folder, load, resolved_yaml
-from beamline.core.process import ChildProcess, Ending, with_our_path
+from beamline.core.process import ChildProcess, ProcessEnd, with_our_path
 from beamline.features.batch.batch import COMMAND
 from beamline.features.trials.launch import command as trial
 from beamline.scan.run_folder import CONFIG
@@ -40,7 +40,7 @@ def said(command: Sequence[str], folder: Path, environment: dict[str, str] | Non
     ):
         if command == COMMAND:  # a worker ends with its stdin
             process.let_go()
-        assert process.wait() is Ending.EXITED
+        assert process.wait() is ProcessEnd.EXITED
     return "".join(lines) + (folder / "stderr").read_text(encoding="utf-8")
 
 

@@ -60,7 +60,7 @@ def test_settings_that_a_device_would_refuse() -> None:
     for change, message in (
         ("devices.camera.roi=[0, 0, 30, 40]", "devices.camera: roi .* must be in steps of 4"),
         ("scan.exposure_s=1e-7", "devices.camera: exposure 1e-07 s lies outside"),
-        ("devices.stage.acceleration_deg_s2=0.001", "devices.stage: .*gentl"),
+        ("devices.stage.acceleration_deg_s2=0.001", "devices.stage: .*least acceleration"),
         ("devices.stage.max_speed_deg_s=5001", r"devices.stage: 5001 deg/s are 5001000 pulses/s, .* 1 to 5000000"),
         ("devices.stage.max_speed_deg_s=0.0001", "devices.stage: 0.0001 deg/s are 0 pulses/s"),
         ("devices.stage.pulse_width_s=0.005", "devices.stage: the trigger output has no pulses of 0.005 s; it has"),

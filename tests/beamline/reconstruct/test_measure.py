@@ -17,6 +17,7 @@ from recon.assess.metrics import ssim_of_whole_slices
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
+from recon.voxels.resolution import ViewResolution, as_voxels_see
 from tests.beamline.prepared_views import prepared_views
 
 DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
@@ -76,6 +77,13 @@ def _prepared(volume: Volume, held_out: bool = False) -> PreparedProjections:
     return prepared_views(data, geometry, held_out=(data, geometry) if held_out else None)
 
 
+def _views_and_as_seen(prepared: PreparedProjections, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Sixteen of the twenty views, which are compared, and these at the resolution of voxels."""
+    some = np.unique(np.linspace(0, 19, 16).round().astype(int))
+    views = prepared.projections.data[some].swapaxes(1, 2)
+    return views, as_voxels_see(views, ViewResolution.of(prepared.geometry.select(some), grid))
+
+
 def _ball() -> Volume:
     return _ball_in((12, 24, 24))
 
@@ -93,7 +101,10 @@ def test_a_perfect_volume(rng: np.random.Generator) -> None:
     assert set(values) == {"psnr", "ssim3d", "nrmse", "residual", "residual_held_out"}
     assert values["psnr"] == pytest.approx(40, abs=0.2)  # noise of 1 % of the peak
     assert values["residual"] < 0.05
-    assert measure(truth, _prepared(truth), truth)["residual"] == 0.0
+    prepared = _prepared(truth)
+    views, seen = _views_and_as_seen(prepared, truth.grid)
+    alone = np.linalg.norm(seen - views) / np.linalg.norm(views)  # its own projection, as views of that sharpness
+    assert measure(truth, prepared, truth)["residual"] == pytest.approx(alone, rel=1e-5)
 
 
 def test_without_a_truth_the_background_tells(rng: np.random.Generator) -> None:
@@ -127,7 +138,11 @@ def test_bands_lie_where_the_matter_is(monkeypatch: pytest.MonkeyPatch) -> None:
     ball = _ball_in((200, 24, 24))
     thin = Volume(np.where(np.isin(np.arange(200), (0, 1, 63, 199))[:, None, None], ball.data[100], 0), ball.grid)
     wrong = Volume(0.8 * thin.data, ball.grid)
-    assert measure(wrong, _prepared(thin), None)["residual"] == pytest.approx(0.2, rel=1e-5)
+    prepared = _prepared(thin)
+    views, seen = _views_and_as_seen(prepared, thin.grid)
+    expected = np.linalg.norm(seen - 0.8 * views) / np.linalg.norm(views)
+    assert expected == pytest.approx(0.2, abs=0.01)
+    assert measure(wrong, prepared, None)["residual"] == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_volume_without_two_regions_has_no_snr() -> None:

@@ -79,7 +79,11 @@ def test_fbp_of_a_region_reports_no_residual() -> None:
         (("--roi", "38:97,10:40,4:29"), 2, "slices 38:97 do not lie in the volume's 0:96"),
         (("--roi", "38:60,10:40,4:49"), 2, "x 4:49 does not lie in the volume's 0:48"),
         (("--roi", "38:60,10:40,4:29", "--cone", "50:70"), 2, "is a cone"),
-        (("--roi", "38:60,10:40,4:29", "--calibrate", "axis,shifts,roll"), 2, "by --calibrate roll and --calibrate s"),
+        (
+            ("--roi", "38:60,10:40,4:29", "--calibrate", "axis,shifts,roll"),
+            2,
+            "--calibrate roll and --calibrate shift",
+        ),
         (("--roi", "38:60,10:40,4:29", "--follow"), 2, "does not go with --follow"),
         (("--roi", "38:60,10:40,4:29", "--max-residual", "1"), 2, "needs the whole volume"),
     ],

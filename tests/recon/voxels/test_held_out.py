@@ -33,7 +33,7 @@ from recon.voxels.held_out import (
     unseen_residuals,
 )
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution
+from recon.voxels.resolution import ViewResolution
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
 
@@ -248,6 +248,6 @@ def test_residuals_leave_out_rays_and_views_that_do_not_count() -> None:
         Geometry.parallel(np.zeros(3), (2, 4), pixel_pitch=1.0),
         Geometry.cone(np.zeros(3), (2, 4), sod=10.0, sdd=20.0, pixel_pitch=1.0),
     ):
-        resolution = Resolution.of(geometry, Grid.matching(geometry))
+        resolution = ViewResolution.of(geometry, Grid.matching(geometry))
         np.testing.assert_allclose(unseen_residuals(model, views, None, resolution), [2.0, 2.0], rtol=1e-6)
         assert np.isinf(unseen_residuals(model, views, np.zeros_like(views), resolution)).all()

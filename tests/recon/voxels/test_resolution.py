@@ -15,7 +15,7 @@ from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution, as_voxels_see, smoothed
+from recon.voxels.resolution import ViewResolution, as_voxels_see, smoothed
 from recon.voxels.voxel_problem import largest_eigenvalue
 
 SIDE, WIDTH = 192, 24.0
@@ -46,7 +46,7 @@ def test_a_plane_wave_loses_what_the_transfer_says(degrees: float, voxel: float)
     geometry, side = Geometry.parallel([math.radians(degrees)], (1, SIDE)), round(SIDE / voxel)
     grid = Grid((1, side, side), voxel, slice_pitch=1.0)
     for f in (0.05, 0.125, 0.25):
-        expected = Resolution.of(geometry, grid).transfer(0, np.array([f]))[0, 0]
+        expected = ViewResolution.of(geometry, grid).transfer(0, np.array([f]))[0, 0]
         assert _response(geometry, grid, f, True) == pytest.approx(expected, abs=0.01)
 
 
@@ -64,33 +64,37 @@ def test_the_excess_of_a_voxel_follows_from_the_geometry() -> None:
     nearer = np.maximum(np.cos(angles) ** 2, np.sin(angles) ** 2)
     parallel = Geometry.parallel(angles, (8, 64), pixel_pitch=0.05)
     grid = Grid.matching(parallel)
-    np.testing.assert_allclose(Resolution.of(parallel, grid).excess, np.stack((nearer / 6, 0 * nearer), 1), atol=1e-3)
+    np.testing.assert_allclose(
+        ViewResolution.of(parallel, grid).excess, np.stack((nearer / 6, 0 * nearer), 1), atol=1e-3
+    )
     cone = Geometry.cone(angles, (8, 64), 0.1, 40.0, 80.0)
     np.testing.assert_allclose(
-        Resolution.of(cone, Grid.matching(cone)).excess, np.stack((nearer / 6, 0 * nearer + 1 / 6), 1), rtol=1e-6
+        ViewResolution.of(cone, Grid.matching(cone)).excess, np.stack((nearer / 6, 0 * nearer + 1 / 6), 1), rtol=1e-6
     )
-    coarse = Resolution.of(cone, Grid((8, 32, 32), 0.1)).excess
+    coarse = ViewResolution.of(cone, Grid((8, 32, 32), 0.1)).excess
     np.testing.assert_allclose(coarse[:, 0], (4 / 12 + 4 * nearer / 6) - 1 / 12)
-    fine = Resolution.of(cone, Grid((8, 128, 128), 0.025)).excess
+    fine = ViewResolution.of(cone, Grid((8, 128, 128), 0.025)).excess
     assert (fine < 0).all()
     blurred = parallel.seen_with(RayWidth(pixel=1, blur=0.3))
     np.testing.assert_allclose(
-        Resolution.of(blurred, grid).excess, Resolution.of(parallel, grid).excess - 0.3**2, atol=1e-9
+        ViewResolution.of(blurred, grid).excess, ViewResolution.of(parallel, grid).excess - 0.3**2, atol=1e-9
     )
-    wide = Resolution.of(parallel.binned(2), Grid.matching(parallel.binned(2))).excess
-    np.testing.assert_allclose(wide, Resolution.of(parallel, grid).excess[:, :], atol=5e-3)  # in its own pixels
+    wide = ViewResolution.of(parallel.binned(2), Grid.matching(parallel.binned(2))).excess
+    np.testing.assert_allclose(wide, ViewResolution.of(parallel, grid).excess[:, :], atol=5e-3)  # in its own pixels
 
 
 def test_a_source_that_stands_apart_sees_voxels_of_its_own_size() -> None:
     cone = Geometry.cone(np.zeros(2), (8, 64), 0.1, 40.0, 80.0)
     nearer = cone.about([(0.0, 0.0, 0.0), (0.0, 10.0, 0.0)])  # the second source is 50 mm from the box's middle
-    excess = Resolution.of(nearer, Grid((8, 64, 64), 0.05)).excess[:, 0] + 1 / 12
+    excess = ViewResolution.of(nearer, Grid((8, 64, 64), 0.05)).excess[:, 0] + 1 / 12
     assert excess[1] / excess[0] == pytest.approx((40 / 30) ** 2)
 
 
 def test_rays_along_an_axis_do_not_interpolate_where_they_meet_voxels() -> None:
     views = Geometry.parallel([0.0, np.pi / 2, 0.3], (4, 64))
-    on, between = (Resolution.of(replace(views, axis_col=31.5 + off), Grid.matching(views)).excess for off in (0, 0.5))
+    on, between = (
+        ViewResolution.of(replace(views, axis_col=31.5 + off), Grid.matching(views)).excess for off in (0, 0.5)
+    )
     np.testing.assert_allclose(on[:2, 0], 0, atol=5e-3)
     np.testing.assert_allclose(between[:2, 0], 1 / 4, atol=5e-3)
     assert on[2, 0] == pytest.approx(between[2, 0], abs=5e-3)
@@ -165,7 +169,7 @@ def test_views_held_out_prefer_the_truth_to_a_sharper_volume(rng: np.random.Gene
 
 def test_rays_that_do_not_count_have_no_part(rng: np.random.Generator) -> None:
     geometry = Geometry.cone(np.arange(3) * 0.5, (20, 24), 2.0, 60.0, 120.0)
-    resolution = Resolution.of(geometry, Grid((14, 17, 17), 1.4))
+    resolution = ViewResolution.of(geometry, Grid((14, 17, 17), 1.4))
     views, counts = np.ones((3, 24, 20), np.float32), rng.random((3, 24, 20)) > 0.1
     views[~counts] = 1e6
     for found in (as_voxels_see(views, resolution, counts), smoothed(views, resolution, counts)):
@@ -177,8 +181,8 @@ def test_rays_that_do_not_count_have_no_part(rng: np.random.Generator) -> None:
 def test_views_are_smoothed_only_where_voxels_are_coarse(rng: np.random.Generator) -> None:
     geometry = Geometry.cone(np.arange(3) * 0.5, (20, 24), 2.0, 60.0, 120.0)
     views = rng.random((3, 24, 20), dtype=np.float32)
-    assert smoothed(views, Resolution.of(geometry, Grid((20, 24, 24), 1.0))) is views
-    resolution = Resolution.of(geometry, Grid((14, 17, 17), 1.4))
+    assert smoothed(views, ViewResolution.of(geometry, Grid((20, 24, 24), 1.0))) is views
+    resolution = ViewResolution.of(geometry, Grid((14, 17, 17), 1.4))
     assert np.ptp(smoothed(views, resolution)) < np.ptp(views)
     both = resolution.sharpened + resolution.smoothed
     np.testing.assert_allclose(both, resolution.excess)

@@ -138,7 +138,7 @@ def test_fbp_without_skew_keeps_its_bits(rng: np.random.Generator) -> None:
 def test_what_has_no_meaning_is_refused() -> None:
     with pytest.raises(ValueError, match="and 0 or"):
         RayWidth(blur=-1)
-    with pytest.raises(ValueError, match="parallel beam"):
+    with pytest.raises(ValueError, match="unless the beam is parallel"):
         CONE.seen_with(RayWidth(), 1e-3)
 
 

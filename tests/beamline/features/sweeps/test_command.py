@@ -20,7 +20,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import Resolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, as_voxels_see
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -134,7 +134,7 @@ def test_other_pixels_have_no_score(folder: Path) -> None:
 def _slice(name: str, image: float, views: HeldOutViews) -> SweptSlice:
     projected = np.full((2, 1, 4), image, np.float32)
     geometry = views.prepared.geometry
-    resolution = Resolution.of(geometry, Grid.matching(geometry))
+    resolution = ViewResolution.of(geometry, Grid.matching(geometry))
     return SweptSlice({"rings": name}, np.zeros((2, 2), np.float32), 0.0, views, projected, resolution)
 
 
