@@ -23,14 +23,13 @@ from beamline.cli.options import (
     together,
 )
 from beamline.core.errors import DataError
-from recon.assess.plans import PRESETS
+from recon.assess.plans import MODEL_STEPS, PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
 from recon.methods import DEFAULT, build, by_name, has_setting, names, taking
-from recon.splatting.settings import MODEL_STEPS
 
 PRESETS_OF_METHODS = ("published",)
 """Endings of names of methods that are variants of another method, such as r2-published."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamline.cli.option_groups import DATA, Grouped, heading
 from beamline.cli.options import json_option, others, scan_argument, set_by, set_option, with_request
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import counting, events_shown
@@ -52,7 +53,11 @@ class MonitorRequest:
     as_json: bool = set_by(json_option)
 
 
-@click.command()
+@click.command(
+    cls=Grouped,
+    first=("follow", "config", "overrides", "sheet", "volume", "angles", "darks", "flats", "data_path", "as_json"),
+)
+@heading(DATA)
 @with_request(MonitorRequest)
 def monitor(request: MonitorRequest) -> None:
     """Look at every frame of the scan in FILE, of any format, with the checks of the monitor.

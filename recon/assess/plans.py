@@ -13,6 +13,9 @@ from recon.base.empirical import DEFAULT_STEPS
 
 _MOST_BINNED = 2  # of the measured curves
 
+MODEL_STEPS = 50
+"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
+
 
 @dataclass(frozen=True)
 class QualityCurve:

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from recon.assess.plans import PRESETS, best_steps
+from recon.assess.plans import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.empirical import DEFAULT_STEPS
@@ -23,7 +23,7 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.settings import MODEL_STEPS, FitSettings, growth
+from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.splatting.work import fit_costs

@@ -24,9 +24,6 @@ from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
 
-MODEL_STEPS = 50
-"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
-
 TV_WIDEST = 96
 """Voxels of that side, at most. Without: a step in 512³ voxels takes longer; not measured."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.plans import best_steps
+from recon.assess.plans import MODEL_STEPS, best_steps
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -45,7 +45,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
-from recon.splatting.settings import MODEL_STEPS, FitSettings, growth, in_steps, tv_size, tv_weight
+from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import UNITS

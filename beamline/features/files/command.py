@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
 from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
 from beamline.cli.scan_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
@@ -26,9 +27,16 @@ if TYPE_CHECKING:
 _PATH = click.Path(path_type=Path)
 
 
-@click.command()
+@click.command(
+    cls=Grouped,
+    first=(
+        "statistics", "output", "truth", "masks", "as_json", "quantity", "angles", "darks", "flats", "data_path",
+    ),
+)  # fmt: skip
 @scan_argument
+@heading(DATA)
 @scan_options
+@heading(OUTPUT)
 @click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
 @click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
 @light_options
@@ -189,10 +197,18 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
         raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
 
 
-@click.command()
+@click.command(
+    cls=Grouped,
+    first=(
+        "pixel_size_um", "energy_kev", "sample", "no_data", "angles", "darks", "flats", "data_path", "quantity",
+        "as_json",
+    ),
+)  # fmt: skip
 @click.argument("source", type=_PATH, metavar="IN", callback=as_scan)
 @click.argument("output", type=_PATH, metavar="OUT.h5")
+@heading(DATA)
 @scan_options
+@heading(OUTPUT)
 @click.option("--pixel-size-um", type=POSITIVE, help="Pixel size at the sample.")
 @click.option("--energy-kev", type=POSITIVE, help="Photon energy.")
 @click.option("--sample", help="Name of the sample, for the record.")
