@@ -15,6 +15,7 @@ from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
+from recon.voxels.resolution import as_voxels_see
 from recon.voxels.view_weights import seen_by
 
 LIMIT = 0.007
@@ -83,10 +84,13 @@ def unexplained(
     matter = np.stack([binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
         return None
-    left = projections[:, rows] - Projector(views, part.grid).forward(part.data)
-    unseen = np.broadcast_to(~seen_rays(views, part.grid), left.shape)
+    measured, projector = projections[:, rows], Projector(views, part.grid)
+    unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
     if weights is not None:
         unseen = unseen | (weights[:, rows] == 0)
+    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, as the model is
+    left = as_voxels_see(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = left - projector.forward(part.data)
     left[unseen] = 0
     left -= ring_offsets(left, views.axis_col)
     left[unseen] = 0
