@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -66,7 +67,9 @@ def warm_up(
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
             toy, on = warmed.toy(), device if warmed is method else "cpu"
             if (key := (type(toy), repr(toy), pickle.dumps(views), on, weighted)) not in _RECONSTRUCTED:
-                reconstruct(data, views, toy, device=on, use=DataUse(weights))
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of a toy nobody needs to be warned
+                    reconstruct(data, views, toy, device=on, use=DataUse(weights))
                 _RECONSTRUCTED.add(key)
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()

@@ -54,7 +54,7 @@ class Grey:
     (
         (
             "recon/methods.py",
-            '    "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),',
+            '    "fbp": MethodEntry("recon.voxels.direct", "Fbp"),',
             '    "grey": MethodEntry("recon.voxels.methods.grey", "Grey"),',
         ),
     ),

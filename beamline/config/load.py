@@ -90,7 +90,9 @@ def takes_text(keys: Sequence[str]) -> bool:
     """Whether a key of the configuration takes any text, and nothing else but null."""
     types: set[Any] = {Config}
     for key in keys:
-        models = [each for each in types if isinstance(each, type) and issubclass(each, BaseModel)]
+        models: list[type[BaseModel]] = [
+            each for each in types if isinstance(each, type) and issubclass(each, BaseModel)
+        ]
         types = {
             member
             for model in models

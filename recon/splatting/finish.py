@@ -46,6 +46,7 @@ FIRST_SHARE = 0.25
 """Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
 
 SUBSETS, TV_STEPS = 9, 3
+_REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
 class _Watch:
@@ -178,14 +179,15 @@ def _without(problem: VoxelProblem, beyond: F32 | None) -> VoxelProblem:
 def beyond_voxels(gaussians: Gaussians, views: Geometry, grid: Grid, settings: FitSettings) -> F32 | None:
     """[view, row, col] what Gaussians explain of the views, and no voxels of their volume can; None: nothing.
 
-    That is matter beyond the box: what Gaussians whose centres lie there add to the views, but not to the voxels.
+    That is matter beyond the box: what Gaussians that reach there add to the views, but not to the voxels.
     Measured views alone would bend the volume, by -12 dB on a region of interest and -22 dB in the end slices of a
     thorax that goes on above the field.
     """
     import torch
 
     half = np.multiply(grid.shape, grid.spacing)[::-1] / 2
-    outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() > torch.from_numpy(half)
+    reach = _REACH * gaussians.scales.max(dim=1, keepdim=True).values
+    outside = (gaussians.means - torch.tensor(grid.centre[::-1])).abs() + reach > torch.from_numpy(half)
     gaussians = gaussians.select(outside.any(dim=1))
     if not gaussians.n:
         return None

@@ -155,17 +155,21 @@ def as_voxels_see(views: F32, resolution: ViewResolution, counts: NDArray[np.boo
 
 
 def _filtered(views: F32, filters: list[F64]) -> F32:
-    found = views.astype(np.float64)
-    for axis, share in enumerate(filters, 1):
-        n = views.shape[axis]
-        if n == 1 or (share == 1).all():
-            continue
-        wide = [(0, 0)] * 3
-        wide[axis] = _PAD, _PAD
-        lines = np.moveaxis(np.pad(found, wide, mode="edge"), axis, 2)
-        lines = np.fft.irfft(np.fft.rfft(lines) * share[:, None], n + 2 * _PAD)
-        found = np.moveaxis(lines[..., _PAD : _PAD + n], 2, axis)
-    return np.ascontiguousarray(found, np.float32)
+    """Views [view, col, row] filtered along columns and rows, one after the other, so that few are held in float64."""
+    out = np.empty_like(views)
+    for at, view in enumerate(views):
+        found = view.astype(np.float64)
+        for axis, shares in enumerate(filters):
+            n, share = view.shape[axis], shares[at]
+            if n == 1 or (share == 1).all():
+                continue
+            wide = [(0, 0), (0, 0)]
+            wide[axis] = _PAD, _PAD
+            lines = np.moveaxis(np.pad(found, wide, mode="edge"), axis, 1)
+            lines = np.fft.irfft(np.fft.rfft(lines) * share, n + 2 * _PAD)
+            found = np.moveaxis(lines[:, _PAD : _PAD + n], 1, axis)
+        out[at] = found
+    return out
 
 
 def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:

@@ -55,8 +55,11 @@ def no_data_of(source: ScanSource) -> Mask | None:
     """
     if source.dtype.kind not in "iu":
         return None
+    ends = _ends(source) if source.frame_bytes <= UNPACKED else []
+    if source.pixel_mask is None and not ends:
+        return None
     marked = np.zeros(source.shape, np.bool_) if source.pixel_mask is None else source.pixel_mask.copy()
-    if source.frame_bytes <= UNPACKED and (ends := _ends(source)):
+    if ends:
         in_all = np.logical_and.reduce(ends)
         if source.dtype.itemsize < 4:
             in_all = in_all.all(axis=0) | in_all.all(axis=1)[:, None]

@@ -106,7 +106,7 @@ def test_a_group_of_flats_alone_with_the_sample_beside_its_place_is_refused() ->
     """It reaches the edge of the field, so that its mass is not known: but no beam doubles within a scan."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = _flats_through(blocks, "displaced")
-    with pytest.raises(DataError, match="absorbs least is 2.* times as bright as the flats"):
+    with pytest.raises(DataError, match=r"absorbs least is 2.* times as bright as the flats"):
         decibels(blocks.source())
 
 

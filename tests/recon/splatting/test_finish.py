@@ -145,7 +145,8 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     fitted, found = (reconstruct(data, views, R2(finish=n), grid=grid).volume.data for n in (0, None))
     raw = reconstruct(data, views, FistaTv(), grid=grid).volume.data
     truth = body[12:23]
-    assert psnr(truth, found) > psnr(truth, fitted) > psnr(truth, raw) + 10
+    assert psnr(truth[2:9], found[2:9]) > psnr(truth[2:9], fitted[2:9]) + 1  # the end slices have few rays to refine
+    assert min(psnr(truth, found), psnr(truth, fitted)) > psnr(truth, raw) + 10
 
 
 def test_coarse_voxels_get_the_mean_over_their_edges() -> None:

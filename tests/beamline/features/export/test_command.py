@@ -97,7 +97,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "v.tif", "--film", "z"], 2, "--film goes with the suffixes .gif and .mp4"),
         (["-o", "v.tif", "--fps", "3"], 2, "--fps is of --film"),
         (["-o", "v.gif", "--film", "z", "--bits", "8"], 2, "its images have 8 bits"),
-        (["-o", "v.gif", "--film", "views"], 5, "holds no scan"),
+        (["-o", "v.gif", "--film", "views"], 5, "is a volume, made by"),
     ],
 )
 def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[str], code: int, said: str) -> None:
@@ -154,7 +154,7 @@ def test_what_is_no_volume_is_refused(volume: Path) -> None:
     before = left(volume)
     for name, said in (
         ("g.tif", "grey values"),
-        ("scan.h5", "volumes"),
+        ("scan.h5", "is a scan"),
         ("empty", "is a folder"),
         ("none.h5", "no vol"),
     ):

@@ -12,12 +12,13 @@ import pytest
 import tifffile
 
 from beamline.features.files import describe as described
-from beamline.storage.readers import wrapped
+from beamline.storage.readers import no_data, wrapped
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 
 def test_info_unpacks_no_large_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wrapped, "UNPACKED", 2**22)
+    for module in (wrapped, no_data):
+        monkeypatch.setattr(module, "UNPACKED", 2**22)
     image = io.BytesIO()
     tifffile.imwrite(image, np.zeros((4096, 4096), np.uint16))
     with zipfile.ZipFile(tmp_path / "s.zip", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as packed:
