@@ -20,7 +20,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
-from recon.base.noise import noise_level
+from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.voxels.view_weights import covers_the_circle
@@ -149,7 +149,8 @@ def _mass_noise(prepared: PreparedProjections, views: Sequence[F32]) -> float:
     rows, cols = views[0].shape
     air = rows * sum(prepared.projections.air_columns)
     pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / air if air else 0.0)
-    return noise_level(np.stack(views)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
+    some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]  # that it reads: all together may not fit
+    return noise_level(np.stack(some)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
 
 
 def _upside_down(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:

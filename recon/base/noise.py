@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 
-_VIEWS = 16  # looked at
+NOISE_VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
@@ -45,7 +45,7 @@ def noise_level(images: F32) -> float:
     Returns:
         The standard deviation; 0 if both axes are too short.
     """
-    some, axes = images[:: max(1, len(images) // _VIEWS)][:_VIEWS], len(_long_axes(images))
+    some, axes = images[:: max(1, len(images) // NOISE_VIEWS)][:NOISE_VIEWS], len(_long_axes(images))
     low, high = _differences(some, _LOW), _differences(some, _HIGH)
     if low == 0:
         return 0.0
@@ -238,7 +238,7 @@ def _differences(images: F32, order: int) -> float:
     n = len(images)
     for axis in axes:
         field = np.diff(field, order, axis=axis)
-    if n >= _VIEWS // 2:
+    if n >= NOISE_VIEWS // 2:
         field = (field - np.nan_to_num(field).mean(axis=0)) * math.sqrt(n / (n - 1))
     return median_deviation(field) / math.comb(2 * order, order) ** (len(axes) / 2)
 

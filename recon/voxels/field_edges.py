@@ -15,7 +15,8 @@ from recon.voxels.view_weights import covers_the_circle
 LEAST = 0.1
 """Line integral at an edge above which matter is there: more than phase fringes, scatter and a drift of air leave."""
 
-_VIEWS, _PARTS, _FULL = 32, 4, 0.5  # views looked at, parts of them; share of the fullest row's mass that a row needs
+_VIEWS, _ROWS, _PARTS = 32, 128, 4  # looked at, about; parts of the views
+_FULL = 0.5  # share of the fullest row's mass that a row needs
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class FieldEdges:
         width = max(2, cols // 50)
         if n == 0 or cols < 2 * width:
             return cls({}, 0.0)
-        some = data[np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))]
+        views = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))
+        some = data[np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))]
         mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
         some = some[:, mass >= _FULL * mass.max()]
         edges = {"left": some[..., :width], "right": some[..., -width:]}

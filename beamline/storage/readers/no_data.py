@@ -75,11 +75,16 @@ def _ends(source: ScanSource) -> list[Mask]:
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
         for row in np.unique(rows[np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int)]) if rows.size else ():
-            image = read_known(source, [int(row)])[0]
-            ends.append(image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max)
+            ends.append(_end_in(source, int(row)))
             if not ends[-1].any():
                 return []
     return ends
+
+
+def _end_in(source: ScanSource, row: int) -> Mask:
+    """Where one frame is at the end of its type."""
+    image = read_known(source, [row])[0]
+    return image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max
 
 
 def counts_photons(source: ScanSource) -> bool:

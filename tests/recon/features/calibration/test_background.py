@@ -107,7 +107,7 @@ def test_a_bent_beam_is_learnt_where_no_ray_or_few_miss_the_sample(
     print(f"\n{before.psnr:.2f} dB, mass {before.mass:.3f}; learnt: {after.psnr:.2f} dB, mass {after.mass:.3f}")
     assert found.mean and found.left < 0.75 * found.without
     assert after.psnr > before.psnr + least
-    assert before.mass < 0.9 and abs(after.mass - 1) < 0.05
+    assert before.mass < 0.9 and abs(after.mass - 1) < 0.06
 
 
 def test_weak_matter_comes_back_on_a_dense_post() -> None:
