@@ -82,9 +82,10 @@ def _ends(source: ScanSource) -> list[Mask]:
 
 
 def _end_in(source: ScanSource, row: int) -> Mask:
-    """Where one frame is at the end of its type."""
-    image = read_known(source, [row])[0]
-    return image < 0 if image.dtype.kind == "i" else image == np.iinfo(image.dtype).max
+    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is taken."""
+    half = source.shape[0] // 2
+    parts = (read_known(source, [row], rows)[0] for rows in (slice(0, half), slice(half, source.shape[0])))
+    return np.concatenate([part < 0 if part.dtype.kind == "i" else part == np.iinfo(part.dtype).max for part in parts])
 
 
 def counts_photons(source: ScanSource) -> bool:
