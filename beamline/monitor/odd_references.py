@@ -24,7 +24,6 @@ from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
     UNLIT,
-    WORST,
     FaultKind,
     Group,
     GroupVerdict,
@@ -32,6 +31,7 @@ from beamline.monitor.references import (
     ReferenceFrame,
     ReferenceLimits,
     is_blank,
+    worst_place,
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import MEDIAN
@@ -152,7 +152,7 @@ def _changed(
         ratio = np.stack([each[lit] / usual[lit] for each in light])
         levels = np.nanmedian(ratio, axis=1)
         local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
-        place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
+        place = worst_place(np.nan_to_num(local))
         noise = float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1))) / MEDIAN
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2
