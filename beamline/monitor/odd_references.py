@@ -31,6 +31,7 @@ from beamline.monitor.references import (
     ReferenceFrame,
     ReferenceLimits,
     is_blank,
+    saturation_limit,
     worst_place,
 )
 from drivers.base.frame import FrameKind
@@ -101,14 +102,15 @@ def _unusable(
     for group in groups:
         least = min(frame.invalid for frame in group)
         hot = 0.0 if not darks else float(np.median([dark.saturated for each in darks for dark in each]))
-        some = min(frame.saturated for frame in group) - hot <= limits.saturated  # else `judge` has the fault of all
+        limit = saturation_limit(group[0], limits)
+        some = min(frame.saturated for frame in group) - hot <= limit  # else `judge` has the fault of all
         for frame in group:
             if frame.invalid > least + INVALID:
                 sentence = f"a share of {{figures}} of the pixels is not finite (limit {least + INVALID:.3g})."
                 odd.append(OddFrame(frame, FaultKind.NOT_FINITE, frame.invalid, least + INVALID, sentence))
-            elif darks is not None and some and frame.saturated - hot > limits.saturated:
-                sentence = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
-                odd.append(OddFrame(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, sentence))
+            elif darks is not None and some and frame.saturated - hot > limit:
+                sentence = f"a share of {{figures}} of the pixels is saturated (limit {limit:.3g})."
+                odd.append(OddFrame(frame, FaultKind.SATURATED, frame.saturated - hot, limit, sentence))
     first_of_row = {each.frame.row: each for each in reversed(odd)}
     return list(reversed(first_of_row.values()))
 
