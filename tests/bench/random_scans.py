@@ -90,7 +90,9 @@ def random_scan(seed: int) -> RandomScan:
         about["shuffled"] = True
     frames = np.stack([expose(scene, each.shot) for each in planned])
     keys = np.array([_KEY[each.kind] for each in planned], np.int32)
-    angles = np.array([np.degrees(each.shot.angle) for each in planned]) + float(rng.choice([0.0, rng.uniform(-90, 90)]))
+    angles = np.array([np.degrees(each.shot.angle) for each in planned]) + float(
+        rng.choice([0.0, rng.uniform(-90, 90)])
+    )
     lines = np.stack(
         [
             scene.sample.line_integrals(np.full(shape[0], each.shot.angle), each.shot.detector)
@@ -124,14 +126,20 @@ def _phantom(rng: np.random.Generator, shape: tuple[int, int], wide: bool, about
         solids.append({"kind": "cylinder", "radius": width / 2, "height": height, "attenuation": deep / 2 / width})
     for _ in range(int(rng.integers(1, 20))):
         size, out, turn = width * rng.uniform(0.03, 0.15), width * 0.33 * rng.random() ** 0.5, rng.uniform(0, 2 * np.pi)
-        centre = [out * np.cos(turn), out * np.sin(turn), float(rng.uniform(-0.4, 0.4)) * min(height, shape[0] * PITCH * 1e-3)]
+        centre = [
+            out * np.cos(turn),
+            out * np.sin(turn),
+            float(rng.uniform(-0.4, 0.4)) * min(height, shape[0] * PITCH * 1e-3),
+        ]
         solid = str(rng.choice(["ellipsoid", "box", "cylinder"]))
         edges = {
             "ellipsoid": {"semi_axes": (size * rng.uniform(0.5, 1, 3)).tolist()},
             "box": {"edges": (2 * size * rng.uniform(0.5, 1, 3)).tolist()},
             "cylinder": {"radius": float(size), "height": float(2 * size)},
         }[solid]
-        solids.append({"kind": solid, **edges, "attenuation": deep / 4 / float(size), "centre": [float(c) for c in centre]})
+        solids.append(
+            {"kind": solid, **edges, "attenuation": deep / 4 / float(size), "centre": [float(c) for c in centre]}
+        )
     return {"kind": "solids", "solids": solids}
 
 
@@ -150,7 +158,11 @@ def _effects(rng: np.random.Generator, about: dict[str, Any], steady: bool) -> l
         ("dead", {"kind": "dead_pixels", "fraction": 2e-4}),
         ("read", {"kind": "read_noise", "rms": float(rng.uniform(0.5, 5))}),
     ]  # fmt: skip
-    chosen = [each for each in some if each[0] == "noise" or (rng.random() < 0.35 and not (steady and each[0] in ("ring", "profile")))]
+    chosen = [
+        each
+        for each in some
+        if each[0] == "noise" or (rng.random() < 0.35 and not (steady and each[0] in ("ring", "profile")))
+    ]
     about["effects"] = [name for name, _ in chosen]
     return [*(effect for _, effect in chosen), "offset"]
 

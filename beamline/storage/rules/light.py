@@ -12,8 +12,9 @@ from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, lit_places, noise_o
 from beamline.monitor.odd_references import LIT
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
+from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure, views_differ
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.references import ReferenceGroups, reference_frame, some_of
+from beamline.storage.rules.references import ReferenceGroups, exposures_of, reference_frame, some_of
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 
@@ -30,7 +31,10 @@ NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sa
 BRIGHT = 90.0  # percentile of a view's transmission where it is air, or nearest to it
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
-BELOW, OF_VIEWS = 0.005, 0.25  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
+BELOW, OF_VIEWS = (
+    0.005,
+    0.25,
+)  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 """Limits, each with its reason."""
 
@@ -216,3 +220,36 @@ def _gain(net: F32, light: F32) -> float:
     tiles = each[: rows * TILE, : cols * TILE].reshape(rows, TILE, cols, TILE).mean(axis=(1, 3))
     known = tiles[np.isfinite(tiles)]
     return float(np.percentile(known, QUIET)) if known.size else math.nan
+
+
+def exposures_agree(source: ScanSource) -> Iterator[Finding]:
+    """Darks are exposed as long as the projections, or darks of two exposures tell those of any other."""
+    if source.quantity != "counts":
+        return
+    usual = usual_exposure(source)
+    darks, flats = (source.exposures[source.image_key == kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    if views_differ(source):
+        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        known = bool((flats > 0).all())
+        taken = exposures_of(source)[source.image_key == FrameKind.FLAT]
+        doubt = f"taken for {usual:g} s" + (
+            "."
+            if known
+            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, by which no "
+            "view is brighter than they: where the sample fills the field, all line integrals may be off by one amount."
+        )
+        yield Finding(
+            "info" if known else "warning",
+            "exposures",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the light of each is {doubt}",
+        )
+    darks = darks[darks > 0]
+    if np.isnan(usual) or not darks.size:
+        return
+    if np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The darks were exposed for {darks[0]:g} s and the projections for {usual:g} s: hot pixels and dark "
+            "current are not the same. Take darks with the projections' exposure.",
+        )
