@@ -31,7 +31,7 @@ ZINGER = 12.0  # times the median change: more is not noise
 BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
 CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
 WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
-ZINGERS = 2  # places or pixels of a frame that they hit, however small it is
+ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
 
 
 @dataclass(frozen=True)

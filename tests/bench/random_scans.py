@@ -56,9 +56,9 @@ class RandomScan:
 def random_scan(seed: int) -> RandomScan:
     """Size, noise, sample, effects, order and turn are random."""
     rng = np.random.default_rng(seed)
-    shape = int(rng.integers(8, 48)), int(rng.integers(56, 144))
+    shape = int(rng.integers(8, 28)), int(rng.integers(56, 112))
     wide = bool(rng.random() < 0.15)
-    views = int(rng.integers(60, 200))
+    views = int(rng.integers(60, 140))
     turn = float(rng.choice([180.0, 360.0])) * float(rng.choice([1, -1], p=[0.8, 0.2]))
     photons = float(10 ** rng.uniform(2.6, 3.75))
     about = {"shape": shape, "views": views, "turn": turn, "photons": photons, "wide": wide}

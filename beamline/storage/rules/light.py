@@ -129,8 +129,8 @@ def darks_beside_views(source: ScanSource, groups: ReferenceGroups, accepted: bo
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
-            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the {light:.4g} "
-            "of light in the flats), though light only adds: the darks are too high. Were they taken with light, with "
+            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the "
+            f"{light:.4g} of light in the flats), though light only adds: the darks are too high. Were they taken with light, with "
             "another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
         )
         sentence += "" if accepted else " --references accept uses these."
@@ -235,8 +235,8 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
         doubt = f"taken for {usual:g} s" + (
             "."
             if known
-            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, by which no "
-            "view is brighter than they: where the sample fills the field, all line integrals may be off by one amount."
+            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, by which "
+            "no view is brighter than they: where the sample fills the field, all line integrals may be off by one amount."
         )
         yield Finding(
             "info" if known else "warning",
