@@ -224,22 +224,21 @@ def full_scale(largest: float) -> float:
 
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    if all(map(_of_one_number, flats)):
-        if all(map(_of_one_number, darks or ())) or not flats[0].rounding:
-            return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
-        sentence = (
-            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there, and the "
-            "light is not known. Shorten the exposure, or look for what cut the counts off."
-        )
-        return ReferenceFault(FaultKind.SATURATED, 1.0, limits.saturated, sentence)
+    written = all(map(_of_one_number, flats))
+    if written and (all(map(_of_one_number, darks or ())) or not flats[0].rounding):
+        return None  # not exposed: the number that stands for all light, such as the full scale of 16 bits
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score, limit = float(np.median([flat.saturated for flat in flats])) - hot, saturation_limit(flats[0], limits)
-    if score <= limit:
+    if score > limit:
+        what = f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known."
+    elif written:
+        score, what = (
+            1.0,
+            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there.",
+        )
+    else:
         return _clipped(flats, darks, limits)
-    sentence = (
-        f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known. "
-        "Shorten the exposure or add a filter."
-    )
+    sentence = f"{what} Shorten the exposure or add a filter."
     return ReferenceFault(FaultKind.SATURATED, score, limit, sentence)
 
 

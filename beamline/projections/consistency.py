@@ -18,7 +18,7 @@ from beamline.projections.selection import Selection, unbinned
 from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.light import WARN, darks_beside_views, light_beside_flats
+from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.noise import NOISE_VIEWS, noise_level
@@ -142,7 +142,7 @@ def compare_with_flats(
     found = list(light_beside_flats(source, groups, level, air, accepted or said or not refused))
     if air and look_negative(projections.data):
         found.append(Finding("warning", "light", _INVERTED))
-    for finding in (*darks_beside_views(source, groups, accepted or not refused), *found):
+    for finding in found:
         refuse(source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
@@ -177,8 +177,8 @@ def _steady(data: F32, some: NDArray[np.intp], frames: NDArray[np.int64]) -> Law
     sentence = (
         f"From frame {frames[at]} to frame {frames[at + 1]} the line integrals of the whole view change by "
         f"{steps[at]:+.2f} at once (others by {np.median(np.abs(steps)):.2g}), and no air beside the sample corrects "
-        "it: light, exposure or filter changed, or views of another scan are among them. Choose views that belong together "
-        "with --views, or say which columns are air."
+        "it: light, exposure or filter changed, or views of another scan are among them. Choose views that belong "
+        "together with --views, or say which columns are air."
     )
     tolerance = max(_STEP_OF_LIGHT, _OF_OTHERS * float(np.median(np.abs(steps))))
     return Law("steps of the light", float(abs(steps[at])), tolerance, "of line integral", sentence)
