@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PlainSerializer, PlainValidator
 
 from recon.base.arrays import I64
 from recon.base.views import parse_views
@@ -19,6 +21,7 @@ DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
 OVERLAPPING = 180  # Number of overlapping windows of each width
 _APART = 0.25  # px between views of a window: a mean of views that lie further apart is blurred
+_Groups = Annotated[I64, PlainValidator(np.asarray), PlainSerializer(np.ndarray.tolist)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class ViewChoice:
     """
 
     label: str
-    groups: I64 | None
+    groups: _Groups | None
     family: str = ""
     reason: str = ""
 
