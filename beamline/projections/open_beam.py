@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import Defects, noise_sentence, photons_of
+from beamline.projections.corrections.counts import noise_sentence, photons_of
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
-    Flats,
-    ReferenceCheck,
     flats_sentence,
     read_references,
-    use_current,
     view_scale,
     warn_of_parts_without_flats,
     with_dynamic_flats,
@@ -46,7 +44,7 @@ class OpenBeam:
             median ring current; None: all views are alike.
         n_references: darks and flats that the file had.
         used: those that are used.
-        done: results of its steps, by name of the step.
+        done: what flats, defects and noise came to, by these names.
     """
 
     references: References
@@ -70,29 +68,28 @@ class OpenBeam:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
             DataError: references that cannot be used.
         """
-        light = view_scale(source, use_current(selection))
-        n, accepted = count_references(source), selection.step(ReferenceCheck).accepted
-        used = groups_taken(source) if accepted else reference_groups(source).good()
+        asked = selection.step(Preparation)
+        light, n = view_scale(source, asked.by_current), count_references(source)
+        used = groups_taken(source) if asked.accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
-        if selection.step(Flats).fields == "dynamic":
+        if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
         tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
         warn_of_parts_without_flats(source, references, warn)
         photons = photons_of(source, used, references, rows, selection)
-        defects = selection.step(Defects)
         settings = CorrectionSettings(
-            defects.floor,
-            defects.hot_threshold,
-            defects.zinger_threshold,
+            asked.floor,
+            asked.hot_threshold,
+            asked.zinger_threshold,
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_sentence(source, references, use_current(selection)), noise_sentence(references, photons)
+        flats, noise = flats_sentence(source, references, asked.by_current), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {
             "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),
+            "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
         return cls(references, settings, photons, light, n, used, done)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.storage.readers.base import ScanSource
@@ -149,7 +149,7 @@ def _widest(source: ScanSource, selection: Selection) -> int:
     An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
     """
     flags = source.flags
-    moved = selection.step(Flags).judged or (flags is not None and bool(flags.flagged.any()))
+    moved = selection.step(Preparation).judged or (flags is not None and bool(flags.flagged.any()))
     if selection.axis_col is None or moved:
         return 2 * (source.shape[1] // selection.binning)
     return Grid.matching(geometry_of(source, selection, selection.axis_col, np.zeros(1))).shape[2]

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.flags import Flags
-from beamline.projections.step import StepMemory, option, positive
-from recon.base.choices import FEW_PHOTONS, Noise
+from beamline.projections.corrections.preparation import Preparation
+from recon.base.choices import FEW_PHOTONS
 
 if TYPE_CHECKING:
-    from beamline.projections.protocols import ScanPart
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.references import ReferenceGroups
@@ -22,59 +19,6 @@ if TYPE_CHECKING:
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
-
-
-@dataclass(frozen=True)
-class CountModel:
-    """How counts become line integrals. `OpenBeam` asks for it.
-
-    Attributes:
-        noise: "log": logarithms of counts; "counts": line integrals and weights carry the likelihood of the counts;
-            "auto": that where the open beam has few photons a pixel.
-        gain: counts a photon, of single pixels; None finds it by the flats.
-    """
-
-    name: ClassVar[str] = "noise"
-    follows: ClassVar[tuple[str, ...]] = ("defects",)
-    needs_finished: ClassVar[str] = ""
-    noise: Noise = option(
-        "--noise",
-        "auto",
-        "log: line integrals are logarithms of counts. counts: for few photons, line integrals and weights that "
-        "represent the likelihood of the counted photons. auto: counts if a pixel of the open beam has fewer than "
-        f"{FEW_PHOTONS}.",
-        choices=get_args(Noise),
-    )
-    gain: float | None = option(
-        "--gain",
-        None,
-        "Counts per photon, for --noise. Default: from the variance of the flats.",
-        parse=positive,
-        metavar="COUNTS",
-    )
-
-    def __post_init__(self) -> None:
-        if self.gain is not None and self.noise == "log":
-            raise ValueError("--gain is for counted photons; it does not go with --noise log.")
-
-    def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory()
-
-
-@dataclass(frozen=True)
-class Defects:
-    """Which pixels are taken from their neighbours. `recon.prep.correct.CorrectionSettings` says what each value means;
-    `OpenBeam` asks for them."""
-
-    name: ClassVar[str] = "defects"
-    follows: ClassVar[tuple[str, ...]] = ("flats",)
-    needs_finished: ClassVar[str] = ""
-    floor: float = 1e-4
-    hot_threshold: float = 10.0
-    zinger_threshold: float = 8.0
-
-    def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory()
 
 
 def photons_of(
@@ -92,13 +36,13 @@ def photons_of(
     from beamline.projections.read import read_binned, spoilt_frames
     from recon.prep.counts import Photons, photon_transfer
 
-    model = selection.step(CountModel)
+    model = selection.step(Preparation)
     if model.noise == "log":
         return None
     binning = selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
-    spoilt = spoilt_frames(source, not selection.step(Flags).used)
+    spoilt = spoilt_frames(source, not model.uses_flags)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (used.flats, used.darks)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamline.core.text import count
-from beamline.projections.step import StepMemory, option
 from beamline.projections.usable_views import Regions, UsableViews
 from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from beamline.projections.protocols import ScanPart
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.base import ScanSource
 
@@ -27,45 +24,6 @@ than noise, not that it is wrong, and there are too few views to do without it."
 WIDE = 2.5
 """A gap between the remaining views is reported when it is this many times the widest gap before: two neighbouring
 views are missing."""
-
-
-@dataclass(frozen=True)
-class Flags:
-    """How the monitor's flags are used. `usable_views` chooses the views; `jumps` corrects those after a jump.
-
-    Attributes:
-        mode: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
-            the frames now, and its flags count in place of the file's. "ignore": all views are alike.
-    """
-
-    name: ClassVar[str] = "flags"
-    follows: ClassVar[tuple[str, ...]] = ()
-    mode: str = option(
-        "--flags",
-        "use",
-        "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, and "
-        "correct views after a jump of the sample. judge: run the monitor on the frames first and use its flags. "
-        "ignore: use all views alike.",
-        choices=("use", "judge", "ignore"),
-    )
-
-    @property
-    def used(self) -> bool:
-        """Views are treated by flags, the file's or new ones."""
-        return self.mode != "ignore"
-
-    @property
-    def judged(self) -> bool:
-        """The monitor looks at the frames first."""
-        return self.mode == "judge"
-
-    @property
-    def needs_finished(self) -> str:
-        sentence = "--flags judge is for a finished scan; a running one is judged while it is taken."
-        return sentence if self.judged else ""
-
-    def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory()
 
 
 def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:

@@ -101,7 +101,7 @@ def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(("--bin", "2"), "go with --bin"), (("--rings", "sort"), "go with the correction 'rings'"),
+    [(("--bin", "2"), "go with --bin"), (("--rings", "sort"), "go with --rings"),
      (("--cols", "2:30"), "go with --cols"), (("--follow",), "do not grow")],
 )  # fmt: skip
 def test_what_counts_do_not_take_is_refused(pet: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
