@@ -14,7 +14,6 @@ from scipy import ndimage
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
-from beamline.projections.corrections.flags import gap_sentence
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
 from beamline.projections.filters import ViewFilters
@@ -22,6 +21,7 @@ from beamline.projections.open_beam import OpenBeam, count_references
 from beamline.projections.read import read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
+from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.rules.unlit import ViewLight

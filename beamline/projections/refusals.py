@@ -6,12 +6,11 @@ from collections.abc import Iterable
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Note, Warn
-from beamline.projections.corrections.flags import usable_views
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import UsableViews
+from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import angle_order
 from beamline.storage.rules.finding import Finding

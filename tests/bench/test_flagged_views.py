@@ -18,7 +18,7 @@ from click.testing import CliRunner
 import recon
 from beamline.cli.main import main
 from beamline.config.load import config_folder
-from beamline.projections.corrections import flags
+from beamline.projections import usable_views as flags
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection

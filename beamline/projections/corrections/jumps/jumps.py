@@ -15,10 +15,10 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import Unmoved
 from beamline.projections.selection import cone_of, geometry_of, rows_of
 from beamline.projections.step import StepDone, StepMemory, option
+from beamline.projections.usable_views import part_numbers
 from drivers.base.frame import FrameKind
 from recon.base.volume import Grid
 from recon.features.jumps.clusters import jump_clusters, part_groups, thinned
-from recon.prep.jump_parts import part_numbers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -173,7 +173,7 @@ def find_jumps(
 def _search_memory(source: ScanSource, selection: Selection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
-    from beamline.projections.corrections.flags import usable_views
+    from beamline.projections.usable_views import usable_views
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
 

@@ -21,8 +21,8 @@ from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, spl
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.features.trials.worker import run
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import DiskBuffer, prepare_projections
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume

@@ -19,7 +19,7 @@ from beamline.features.trials.data import TrialData, write_array
 from beamline.features.trials.launch import JOB, TrialJob
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import main, on_grid, run
-from beamline.projections.held_out import with_views_held_out
+from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

@@ -13,7 +13,6 @@ import pytest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.beam_hardening.hardening import Hardening
 from beamline.projections.corrections.calibration.calibrate import Calibrate
-from beamline.projections.corrections.flags import usable_views
 from beamline.projections.corrections.jumps.jumps import Jumps
 from beamline.projections.corrections.phase.phase import Phase
 from beamline.projections.corrections.preparation import Preparation
@@ -23,6 +22,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
+from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths

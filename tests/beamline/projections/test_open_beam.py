@@ -11,9 +11,8 @@ from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection
 from beamline.reconstruct.budget import binned
 from recon.base.choices import Noise

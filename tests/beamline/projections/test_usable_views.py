@@ -11,12 +11,11 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import WARNED_WEIGHT
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection
+from beamline.projections.usable_views import WARNED_WEIGHT
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.treatment import FEWEST_VIEWS
 from drivers.base.frame import FrameKind
