@@ -13,11 +13,11 @@ import click
 from beamline.cli.options import json_events, set_option
 from beamline.core.events import Diagnosed, Done
 from beamline.core.stop import terminated_like_interrupted
-from beamline.features.doctor.devices import Grade
+from beamline.features.doctor.check import Grade
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.features.doctor.devices import Diagnosis
+    from beamline.features.doctor.check import Diagnosis
 
 _STYLES = {
     Grade.OK: "green",
@@ -48,7 +48,7 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
     Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """
     from beamline.config.load import load
-    from beamline.features.doctor.devices import Diagnosis
+    from beamline.features.doctor.check import Diagnosis
     from beamline.features.doctor.examine import examine
 
     if file is None and overrides:

@@ -8,57 +8,24 @@ import os
 import re
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import psutil
 
 from beamline.config.devices import DcamOrca
+from beamline.features.doctor.check import Diagnosis, Grade, of_error
 from drivers.base.errors import DeviceError
 from drivers.dcam import session as usb
 from drivers.serial.ports import SerialPort
 
 if TYPE_CHECKING:
     from drivers.dcam.abi import Dcam
-
-
-class Grade(StrEnum):
-    OK = "ok"
-    WARNING = "warning"  # it works, with a small margin
-    FAILED = "failed"  # a scan would fail, or lose frames
-    NOT_APPLICABLE = "not applicable"
-    CANNOT_CHECK = "cannot check"  # this machine does not report it
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """One result.
-
-    Attributes:
-        observed, expected, advice: sentences or parts of them, for people; may be empty.
-        values: the same as numbers, for programs; bytes, bytes/s, s.
-    """
-
-    name: str
-    verdict: Grade
-    observed: str
-    expected: str = ""
-    advice: str = ""
-    values: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-
-def of_error(name: str, error: DeviceError, expected: str, verdict: Grade = Grade.FAILED) -> Diagnosis:
-    """The check that failed with an error of a device."""
-    reply = f" It answered {error.reply!r}." if error.reply else ""
-    observed = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
-    return Diagnosis(name, verdict, observed, error.expected or expected, error.advice)
 
 
 CONNECT_TIMEOUT = 2.0  # s for a TCP connection

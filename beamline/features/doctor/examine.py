@@ -25,7 +25,8 @@ from beamline.core.machine import free_memory
 from beamline.core.own_packages import OWN_PACKAGES, clashing_distributions
 from beamline.core.text import size
 from beamline.features.doctor import devices
-from beamline.features.doctor.devices import Diagnosis, Grade, of_error, port, ports
+from beamline.features.doctor.check import Diagnosis, Grade, of_error
+from beamline.features.doctor.devices import port, ports
 from beamline.instrument.connect import make_beam_monitor
 from beamline.plan.limits import ROOM as MARGIN
 from beamline.scan.preflight import DryRun, disk_of, dry_run

@@ -11,7 +11,7 @@ from types import ModuleType
 import pytest
 
 from beamline.core import own_packages
-from beamline.features.doctor.devices import Grade
+from beamline.features.doctor.check import Grade
 from beamline.features.doctor.examine import packages
 
 ROOT = Path(__file__).parents[3]

@@ -13,7 +13,8 @@ import usb.core
 
 from beamline.config.devices import DcamOrca
 from beamline.features.doctor import devices
-from beamline.features.doctor.devices import Grade, port, ports
+from beamline.features.doctor.check import Grade
+from beamline.features.doctor.devices import port, ports
 from drivers.dcam import session as preflights
 from drivers.serial.ports import SerialPort
 from tests.drivers.dcam.fake import World, build

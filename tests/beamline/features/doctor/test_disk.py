@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.features.doctor import examine as disk
-from beamline.features.doctor.devices import Grade
+from beamline.features.doctor.check import Grade
 from beamline.features.doctor.examine import ScanNeeds, memory
 from drivers.base.clock import SystemClock
 from simulators.devices.clock import VirtualClock
