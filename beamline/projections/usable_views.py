@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import count
-from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.binning import bin_views
 
 if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags
+    from beamline.storage.readers.base import ScanSource
     from recon.prep.resample import Resampling
 
 
