@@ -131,8 +131,7 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
     A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
     of an emission are added. A ray weighs as the least of its window.
     """
-    groups = choice.groups
-    assert groups is not None
+    groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
     if choice.window == 1 and prepared.emission is None:
         return middle

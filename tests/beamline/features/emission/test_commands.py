@@ -191,7 +191,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     with open_scan(pet) as source:
         prepared = prepare_projections(source, Selection(), pytest.fail)
     assert prepared.emission is not None
-    groups = np.arange(24).reshape(12, 2)
+    groups = np.arange(24).reshape(12, 2).tolist()
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
     data = TrialData(prepared, None)
