@@ -28,7 +28,8 @@ from recon.voxels.direct import direct
 F32 = NDArray[np.float32]
 _REFERENCES = 8  # darks and flats that are averaged
 _VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
-_MOST, _FAST_MOST = 1024, 256  # voxels of the slice along a side
+_MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
+_NEAR = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
 _BESIDE = 2  # rows beside that of the slice, by which the axis is found
 _MISSES = math.radians(2)  # by which a pair may miss half a turn
 
@@ -143,7 +144,8 @@ class ShownScan:
         data, angles = self._lines[::every], self._source.angles[self._ids[::every]]
         geometry = geometry_of(self._source, Selection(rows=(self._band.start, self._band.stop)), axis_col, angles)
         whole = Grid.matching(geometry)
-        n, voxel, height = whole.shape[1], whole.voxel_size, 0.0
+        cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
+        n = cols if abs(axis_col - (cols - 1) / 2) < _NEAR * cols else whole.shape[1]  # else it jumps with each column
         shown, most = region.inside((n, n)), _FAST_MOST if fast else _MOST
         ends = (shown.first_row, shown.last_row), (shown.first_col, shown.last_col)
         step = -(-max(last - begin for begin, last in ends) // most)

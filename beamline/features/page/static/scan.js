@@ -47,7 +47,6 @@ async function showAxis(opposite) {
   set(start);
   for (const [slider, box] of [["axis-slider", "axis-col"], ["tilt-slider", "tilt-deg"]]) {
     $(slider).addEventListener("input", () => { $(box).value = $(slider).value; redraw(true); });
-    $(slider).addEventListener("change", () => redraw(false));
     $(box).addEventListener("input", () => set(chosen()));
   }
   $("at1").addEventListener("input", debounce(() => redraw(false), 100));
