@@ -200,7 +200,8 @@ function widthOf({ distance, values }) {
     while (i + 1 < b && (height[i + 1] - 0.5) * (height[a] - 0.5) > 0) i++;
     return distance[i] + (0.5 - height[i]) / (height[i + 1] - height[i]) * (distance[i + 1] - distance[i]);
   });
-  return fall - rise;
+  const sharp = edges.every(([a, b]) => distance[b - 1] - distance[a] <= 0.6 * (fall - rise));  // else there is a step on the way
+  return sharp ? fall - rise : null;
 }
 
 async function showProfile() {
