@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 
 _RESIDUAL_VIEWS = 16
 RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
@@ -210,7 +210,7 @@ def squares_left(
     """
     known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
     own = np.where(known, views, np.float32(0))
-    seen = as_voxels_see(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
+    seen = at_voxel_resolution(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
     left = np.where(known, projected - seen, 0)
     sums = [np.square(each, dtype=np.float64).sum(axis=(1, 2)) for each in (left, own)]
     return sums[0], sums[1]

@@ -4,7 +4,7 @@ Both directions run on lines along z: volumes [y, x, z], projections [view, col,
 that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
 and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
-A projection has the resolution of the views, see `ViewResolution`: of pixels one pitch wide, or as `Geometry.width` says.
+A projection has the resolution of the views, see `ViewResolution`: of pixels one pitch wide, or of `Geometry.width`.
 With an arc, a view is the mean of views at angles within it. Both are linear and transposed exactly. Pixels should not
 be much larger than voxels, or voxels between the rays are not seen.
 

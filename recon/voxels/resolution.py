@@ -1,4 +1,4 @@
-"""At what resolution views and voxels are compared: how much blurrier voxels are, and who makes up for it.
+"""How much blurrier projections of voxels are than measured views, and where that is corrected.
 
 A pixel of a view is the mean of line integrals over its area, of variance p²/12 along columns and along rows. A voxel
 of a volume is the mean of the object over its edges h, of variance h²/12 along every direction. Its projection by
@@ -25,7 +25,9 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.spread import passes_of, spread
 
-_MOST = 1 / 6  # px² of excess that sharpening corrects, as voxels as wide as pixels have; views are smoothed by the rest
+_MOST = (
+    1 / 6
+)  # px² of excess that sharpening corrects, as voxels as wide as pixels have; views are smoothed by the rest
 _ALL = 1 / 6  # of an edge squared: variance of interpolation at all distances, on average
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _NOTHING = 1e-9  # px²: rounding
@@ -43,14 +45,14 @@ class ViewResolution:
         interpolation: [view, 3], variance along these axes of a ray's interpolation, in squares of an edge: 1/6, the
             mean over all distances d, but for a parallel view along a grid axis, where all rays have one: d (1 - d).
         views: variance of a pixel in px², and of the detector's blur.
-        of_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are not:
-            a slab would depend on the rows beside it, and views that lean a little on how much.
+        sharpens_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are
+            not: a slab would depend on the rows beside it, and views that lean a little on how much.
     """
 
     voxels: F64
     interpolation: F64
     views: tuple[float, float]
-    of_rows: bool
+    sharpens_rows: bool
 
     @classmethod
     def of(cls, geometry: Geometry, grid: Grid) -> ViewResolution:
@@ -79,8 +81,8 @@ class ViewResolution:
 
     @property
     def sharpened(self) -> F64:
-        """[view, 2] px², that the model takes off its projections; negative: that it adds to them."""
-        most = self._most[:, None] * (1.0, float(self.of_rows))
+        """[view, 2] px² of variance that the model takes off its projections; negative: that it adds to them."""
+        most = self._most[:, None] * (1.0, float(self.sharpens_rows))
         return np.minimum(np.where(self.excess > 0, SHARPENED * self.excess, self.excess), most)
 
     @property
@@ -90,7 +92,7 @@ class ViewResolution:
 
     @property
     def smoothed(self) -> F64:
-        """[view, 2] px², that is added to the views, since voxels are too coarse for their edges."""
+        """[view, 2] px² of variance added to the views, whose edges are sharper than coarse voxels can show."""
         beyond = self.excess - self._most[:, None]
         return np.where(beyond > _NOTHING, beyond, 0.0)
 
@@ -150,7 +152,7 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     return np.where(still & (found > 0), np.round(d * (1 - d), _DIGITS), found)
 
 
-def as_voxels_see(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
+def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
     """Views [view, col, row] at the resolution of projections of a volume by the model; only rays that count have part.
 
     A ray that does not count, or has few beside it that do, keeps its value.
@@ -183,7 +185,7 @@ def _filtered(views: F32, filters: list[F64]) -> F32:
 
 
 def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
-    """Views [view, col, row] without what voxels are too coarse for; the same array where they are not.
+    """Views [view, col, row], low-pass filtered to the resolution of coarse voxels; the same array for fine ones.
 
     Rays that do not count have no part.
     """

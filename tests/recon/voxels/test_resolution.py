@@ -15,7 +15,7 @@ from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import ViewResolution, as_voxels_see, smoothed
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution, smoothed
 from recon.voxels.voxel_problem import largest_eigenvalue
 
 SIDE, WIDTH = 192, 24.0
@@ -191,9 +191,9 @@ def test_rays_that_do_not_count_have_no_part(rng: np.random.Generator) -> None:
     resolution = ViewResolution.of(geometry, Grid((14, 17, 17), 1.4))
     views, counts = np.ones((3, 24, 20), np.float32), rng.random((3, 24, 20)) > 0.1
     views[~counts] = 1e6
-    for found in (as_voxels_see(views, resolution, counts), smoothed(views, resolution, counts)):
+    for found in (at_voxel_resolution(views, resolution, counts), smoothed(views, resolution, counts)):
         np.testing.assert_allclose(found[counts], 1, rtol=1e-5)
-    plain = as_voxels_see(np.ones_like(views), resolution)
+    plain = at_voxel_resolution(np.ones_like(views), resolution)
     np.testing.assert_allclose(plain, 1, rtol=1e-6)
 
 
