@@ -139,7 +139,7 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
         if "." in name:
             outer, inner = name.split(".", 1)
             nested.setdefault(outer, {})[inner] = setting
-    kinds = types_of(type(method))
+    kinds = types_of(method.__class__)
     for name, value in flat.items():
         if not is_of_type(value, kinds.get(name, Any)):
             raise ValueError(refusal(name, value, kinds[name]))
