@@ -117,11 +117,11 @@ def preset_of(method: str | None, preset: str | None) -> str | None:
     return name
 
 
-def resumes_slabs(path: Path | None) -> bool:
-    """Whether the file of --resume is a partial volume."""
+def slabs_resumed(path: Path | None) -> Path | None:
+    """The file of --resume if it is a partial volume; else None."""
     from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
 
-    return path is not None and is_partial(path)
+    return path if path is not None and is_partial(path) else None
 
 
 preset_option = option(
