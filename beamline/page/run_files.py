@@ -57,7 +57,10 @@ def watched(path: Path) -> Watched:
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
-            raise DataError(f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file.")
+            raise DataError(
+                f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file; `beamline "
+                f"view {path}` shows images."
+            )
         return Watched(folder / SCAN, folder)
     if not path.is_file():
         raise DataError(f"{path} is not there.")

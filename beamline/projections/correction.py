@@ -253,9 +253,15 @@ class ScanCorrection:
             )
 
     def _no_view(self) -> NoViewError:
+        beside_flats = (
+            ""
+            if self._light.flat is None
+            else f" The brightest have {self._light.usual:.2g} of the flats' light. Where views were divided by their "
+            "flats already, say --quantity transmission, or line-integrals."
+        )
         return NoViewError(
             f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
-            "light, or differ from their checksums."
+            f"light, or differ from their checksums.{beside_flats}"
         )
 
     def _tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:

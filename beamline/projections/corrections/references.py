@@ -115,7 +115,9 @@ def with_dynamic_flats(
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections' median; 1 where one is
     unknown. With `by_current` also from its own ring current."""
-    scale = _to_median(source.exposures, source.image_key)
+    from beamline.storage.rules.references import exposures_of
+
+    scale = _to_median(exposures_of(source), source.image_key)
     return scale * current_scale(source) if by_current else scale
 
 
