@@ -138,8 +138,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     if there:
         require_there(file, values["as_json"])
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
-    from beamline.reconstruct.options import FollowTiming, ReconOptions
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
+    from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
     from recon.voxels.enough_views import Goal
 
     page = report_beside(path) if values["report"] else None

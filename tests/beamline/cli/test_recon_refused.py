@@ -140,7 +140,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_work(folder: Path, monkeypa
     class Full(NamedTuple):
         free: int
 
-    monkeypatch.setattr("beamline.reconstruct.output_paths.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
+    monkeypatch.setattr("beamline.reconstruct.options.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
     result = beamline("recon", "scan.h5", "-m", "fbp")
     assert result.exit_code == 5
     assert "The volume takes 12.8 kB, the disk of scan_fbp.h5 has 12.8 kB free" in result.stderr
