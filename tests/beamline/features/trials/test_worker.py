@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 import recon.warm_up
 from beamline.core.errors import DataError
 from beamline.features.trials import worker as module
-from beamline.features.trials.data import TrialData, write_array
-from beamline.features.trials.launch import JOB, TrialJob
+from beamline.features.trials.launch import JOB, TrialData, TrialJob, write_array
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import main, on_grid, run
 from beamline.projections.prepared import with_views_held_out
