@@ -137,8 +137,7 @@ def _why(errors: Mapping[str, float]) -> str:
 
 _GAP, _LINE = 14, 15  # pixels: between panels, a line of text
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
-_SIGMAS = 5.0  # range of the differences
-_COLOURS = ((31, 119, 180), (255, 255, 255), (214, 39, 40))  # of the least difference, none, the largest
+_SIGMAS, _MOST = 5.0, 99.0  # least range of the differences, and the percentile that it reaches: shapes stay seen
 _ORANGE = (255, 127, 14)
 _DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
 Wedge = tuple[float, float]
@@ -229,12 +228,13 @@ def _view_panels(view: F32, render: F32) -> list[_Panel]:
     noise = noise_level(view[None]) or 0.01 * (window[1] - window[0])
     difference = (view - render) / np.float32(noise)
     greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
-    spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
+    reach = max(_SIGMAS, float(np.percentile(np.abs(difference), _MOST)))
+    spread = f"black {-reach:.2g} to white {reach:.2g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
     (view, render, difference), _ = _sized((view, render, difference))
     return [
         _Panel(view, window, "newest view, u → z ↓", greys),
         _Panel(render, window, "the fit seen from there", "the same greys"),
-        _Panel(difference, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread, signed=True),
+        _Panel(difference, (-reach, reach), "difference in noise of a pixel", spread),
     ]
 
 
@@ -244,7 +244,7 @@ class _Panel:
 
     Attributes:
         pixels: of the screen [row, col].
-        limits: values that are black and white; of differences (`signed`) blue and red.
+        limits: values that are black and white.
         label, note: the two lines.
         bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
         unseen: for a dial of the rays in a slice across z that no view has taken yet; None: no dial.
@@ -255,7 +255,6 @@ class _Panel:
     label: str
     note: str
     bar: tuple[float, str] | None = None
-    signed: bool = False
     unseen: Wedge | None = None
 
     def draw(self, picture: Image, left: int, top: int) -> None:
@@ -267,9 +266,7 @@ class _Panel:
             draw.text((left, top + line * _LINE), text, colour, _font(11))
         top += 2 * _LINE
         shares = (self.pixels - self.limits[0]) / (self.limits[1] - self.limits[0])
-        ends = _COLOURS if self.signed else ((0,) * 3, (127.5,) * 3, (255,) * 3)
-        coloured = [np.interp(shares, (0, 0.5, 1), channel) for channel in zip(*ends, strict=True)]
-        picture.paste(Image.fromarray(np.stack(coloured, -1).astype(np.uint8)), (left, top))
+        picture.paste(Image.fromarray((255 * np.clip(shares, 0, 1)).astype(np.uint8)), (left, top))
         if self.bar is not None:
             pixel, unit = self.bar
             length = round_length(pixel * self.pixels.shape[1] / 3)  # a third of the image at most
