@@ -15,10 +15,9 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, event_in
-from beamline.core.files import EVENTS, is_below, open_below, parts_of, require_below, run_of
+from beamline.core.files import EVENTS, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
-from beamline.scan.run_folder import RECON, SCAN
 from beamline.scan.runs import DIED
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
