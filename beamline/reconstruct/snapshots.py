@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -135,7 +136,7 @@ def _why(errors: Mapping[str, float]) -> str:
     return f"which predicts views held out better (error of the volume along them: {each})"
 
 
-_GAP, _LINE = 14, 15  # pixels: between panels, a line of text
+_GAP, _LINE, _LETTER = 14, 15, 9  # pixels: between panels, a line of text, a letter of a heading at most
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
 _SIGMAS, _MOST = 5.0, 99.0  # least range of the differences, and the percentile that it reaches: shapes stay seen
 _ORANGE = (255, 127, 14)
@@ -146,7 +147,7 @@ Wedge = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class PictureRow:
-    """Panels side by side, below a heading of one line; "": none."""
+    """Panels side by side, below a heading; "": none."""
 
     heading: str
     panels: Sequence[_Panel]
@@ -158,13 +159,15 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
 
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
-    headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
-    size = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
+    headings = [wrap(row.heading, (3 * across - _GAP) // _LETTER) for row in rows]
+    above = sum((1 + len(lines)) * _LINE for lines in headings if lines)
+    size = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + above + _GAP
     picture, top, file = Image.new("RGB", size, "white"), 0, io.BytesIO()
-    for row, pixels in zip(rows, tall, strict=True):
-        if row.heading:
-            ImageDraw.Draw(picture).text((_GAP, top + _LINE), row.heading, "black", _font(13, bold=True))
-            top += 2 * _LINE
+    for row, lines, pixels in zip(rows, headings, tall, strict=True):
+        for line in lines:
+            top += _LINE
+            ImageDraw.Draw(picture).text((_GAP, top), line, "black", _font(13, bold=True))
+        top += _LINE * bool(lines)
         for k, panel in enumerate(row.panels):
             panel.draw(picture, _GAP + k * across, top + _GAP)
         top += _GAP + 2 * _LINE + pixels
