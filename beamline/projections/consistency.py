@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
@@ -130,7 +130,7 @@ def compare_with_flats(
     """
     if source.quantity != "counts" or not len(projections.data):
         return {}
-    accepted = selection.step(ReferenceCheck).accepted
+    accepted = selection.step(Preparation).accepted
     said = selection.step(Air).model != "auto"  # columns that are said to be air
     groups = groups_taken(source) if accepted else reference_groups(source).good()
     if not (groups.darks and groups.flats):

@@ -118,7 +118,8 @@ def orthogonal_slices(
     unit: str,
     kind: VoxelKind = VoxelKind.ATTENUATION,
 ) -> bytes:
-    """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
+    """A row of three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers
+    show them.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
 
@@ -134,30 +135,26 @@ def orthogonal_slices(
     at = bright_centre(list(volumes.values())[-1].data)
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     greys = matter_window(*(image for images in slices.values() for image in images))
-    heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
-    column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
-    size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
-    figure = new_figure(size, dpi_for(nx, column - 0.35))
-    panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
-    for j, (name, images) in enumerate(slices.items()):
-        for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
-            axes = panels[i][j]
+    height = max(ny / nx, nz / nx, nz / ny, _THIN)
+    column = min((WIDTH - 1.2) / 3, 12 / (height * len(volumes)))
+    size = 1.2 + 3 * column, 0.5 + ((column - 0.5) * height + 0.5) * len(volumes)
+    figure = new_figure(size, dpi_for(nx, column - 0.5))
+    panels = figure.subplots(len(volumes), 3, squeeze=False)
+    for row, (name, images) in zip(panels, slices.items(), strict=True):
+        for i, (axes, image, (across, down, h_edges, v_edges)) in enumerate(
+            zip(row, images, planes(first), strict=True)
+        ):
             thin = image.shape[0] < _THIN * image.shape[1]
             shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
-            axes.tick_params(labelsize=7)
-            axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
-            axes.set_xlabel(f"{across} ({unit})", fontsize=8)
-            if j == 0:
-                axes.set_ylabel(downwards(down, unit), fontsize=8)
-                cut = first.coordinates()[i][at[i]]
-                text = axes.text(0.02, 0.04, f"{'zyx'[i]} = {cut:.3g} {unit}", fontsize=7, transform=axes.transAxes)
-                text.set_bbox({"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5})
-            else:
-                axes.tick_params(labelleft=False)
-            if i == 0:
-                axes.set_title(name, fontsize=11)
-    bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
-    bar.set_label(kind.label(unit))
+            axes.tick_params(labelsize=6)
+            axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
+            axes.set_xlabel(f"{across} ({unit})", fontsize=7, labelpad=1)
+            axes.set_ylabel(downwards(down, unit), fontsize=7, labelpad=1)
+            place = f"{'zyx'[i]} = {first.coordinates()[i][at[i]]:.3g} {unit}"
+            axes.set_title(place if i else f"{name}, {place}", fontsize=8, pad=3)
+    bar = figure.colorbar(shown, ax=panels, shrink=0.8, pad=0.01, aspect=30)
+    bar.set_label(kind.label(unit), fontsize=7)
+    bar.ax.tick_params(labelsize=6)
     return png(figure)
 
 

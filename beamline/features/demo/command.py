@@ -98,10 +98,10 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         ConfigError: for a real instrument, where there is no truth.
         DataError: the live reconstruction failed; the scan is in its file.
     """
+    from beamline.core.files import RECON, RECON_LOG
     from beamline.instrument.connect import connect
     from beamline.scan.live_process import follow_command
     from beamline.scan.run import run_scan
-    from beamline.scan.run_folder import RECON, RECON_LOG
 
     clock = SystemClock()
     started = clock.now()
@@ -150,8 +150,8 @@ def _compare(
     from beamline.gaussians.model import read_model
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
+    from beamline.reconstruct.options import OutputPaths, report_beside
     from beamline.reconstruct.outcome import ReportContext, facts_of
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.reconstruct.result import axis_of, write_result
     from beamline.report.record import history_from
     from beamline.storage.readers.open import open_scan

@@ -150,7 +150,7 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
 
 def _options(context: click.Context) -> ReconOptions:
     """The options of one reconstruction, of which no volume is written."""
-    from beamline.reconstruct.output_paths import OutputPaths
+    from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")
@@ -252,8 +252,8 @@ def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     """Print the time and memory of the sweep."""
+    from beamline.core.machine import Need
     from beamline.core.machine_speed import MachineSpeed
-    from beamline.core.need import Need
     from beamline.core.text import count, size
     from beamline.features.sweeps.sweep import sliced
     from beamline.reconstruct.estimate import estimate

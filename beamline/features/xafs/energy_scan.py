@@ -13,8 +13,7 @@ from scipy.ndimage import binary_dilation
 from beamline.config.tree import read
 from beamline.core.errors import ConfigError
 from beamline.features.xafs.contrast import ContrastRegions
-from beamline.features.xafs.radiographs import line_integrals
-from beamline.features.xafs.series import Series
+from beamline.features.xafs.series import Series, line_integrals
 from beamline.scenes.scene_file import open_scene
 from beamline.simulate.volumes import volumes_beside
 from simulators.frame.mapping import SceneError
