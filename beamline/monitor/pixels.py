@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
@@ -54,7 +54,7 @@ class PixelsCheck:
     meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
+    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
 
     start = PixelsState
 

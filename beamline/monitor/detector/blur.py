@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
@@ -64,7 +64,9 @@ class BlurCheck:
     meaning: ClassVar[str] = "the view is less sharp than the views before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")] = 0.3
+    warn: Annotated[
+        float, pydantic.Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")
+    ] = 0.3
 
     start = BlurState
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
@@ -163,8 +163,10 @@ class GhostCheck:
     )
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the ghost")] = 0.01
-    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
+    warn: Annotated[
+        float, pydantic.Field(ge=0, description="relative change of the light in the middle of the ghost")
+    ] = 0.01
+    alarm: Annotated[float, pydantic.Field(ge=0, description="relative change that is an alarm")] = 0.8
 
     start = GhostState
 
