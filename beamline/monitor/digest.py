@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from beamline.core.jit import njit
+from recon.base.jit import njit
 
 ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many

@@ -11,11 +11,11 @@ import pydantic
 import scipy
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import njit
 
 DEAD = 0.2  # share of the light of the darkest preview block around it
 NAMED = 5  # most pixels that are named

@@ -60,7 +60,7 @@ def compile_for(checkouts: Sequence[str]) -> None:
     for module in sorted({module for module, _ in signatures}):
         loaded = importlib.import_module(module)
         for value in list(vars(loaded).values()):
-            getattr(value, "_dispatcher", None)  # `beamline.core.jit` makes it when it is first asked for
+            getattr(value, "_dispatcher", None)  # `recon.base.jit` makes it when it is first asked for
         kernels = [d for d in gc.get_objects() if issubclass(type(d), Dispatcher) and d.py_func.__module__ == module]
         for kernel in kernels:
             for types in signatures.get((module, kernel.py_func.__qualname__), ()):

@@ -16,12 +16,12 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter, running_mean
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import njit
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
 STRIP = 6  # neighbouring rows that are used together

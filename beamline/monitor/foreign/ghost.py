@@ -16,12 +16,12 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame
 from recon.base.arrays import median_deviation
+from recon.base.jit import njit
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
