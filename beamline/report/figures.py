@@ -28,6 +28,8 @@ DPI = 110
 _FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as that goes
 WIDTH = 8.6  # inches; the report's column
 _PROFILE = 16.0  # voxels to either side of an edge
+_LEFT, _TOP, _BELOW, _GAP, BAR = 0.95, 0.35, 0.5, 0.15, 1.0  # inches around panels, between them, of a bar of colours
+_BESIDE_BAR = WIDTH - _LEFT - BAR
 _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
@@ -64,16 +66,18 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
-    height = np.clip(0.82 * WIDTH * rows / cols, 1.6, 6.0)
-    figure, axes = one_panel(height + 0.8)
+    thin = rows < _THIN * cols
+    height = float(np.clip(_BESIDE_BAR * rows / cols, 1.6, 6.0))
+    width = _BESIDE_BAR if thin else min(_BESIDE_BAR, height * cols / rows)
+    figure, ((axes,),) = panels([width], [height], right=BAR)
     edges = left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch
-    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=rows < _THIN * cols)
+    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=thin)
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     axes.set(
         xlabel=f"u ({unit})", ylabel=downwards("z", unit), title=f"View at {np.degrees(geometry.angles[view]):.2f}°"
     )
-    figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
+    add_bar(figure, image, "line integral")
     return png(figure)
 
 
@@ -84,7 +88,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     order = np.argsort(geometry.angles, kind="stable")
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
-    figure, axes = one_panel(4.2)
+    figure, ((axes,),) = panels([_BESIDE_BAR], [3.4], right=BAR)
     image = show_grey(axes, image_rows, grey_window([image_rows]), stretched=True)
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
@@ -92,7 +96,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
     axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
     axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
-    figure.colorbar(image, ax=axes, label="line integral", pad=0.02)
+    add_bar(figure, image, "line integral")
     return png(figure)
 
 
@@ -135,20 +139,19 @@ def orthogonal_slices(
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     greys = matter_window(*(image for images in slices.values() for image in images))
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
-    column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
-    size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
-    figure = new_figure(size, dpi_for(nx, column - 0.35))
-    panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
+    column = min((WIDTH - _LEFT - BAR) / len(volumes) - _GAP, 4.25, 12 / sum(heights))
+    down = [column * height for height in heights]
+    figure, rows = panels([column] * len(volumes), down, dpi_for(nx, column), right=BAR)
     for j, (name, images) in enumerate(slices.items()):
-        for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
-            axes = panels[i][j]
+        for i, (image, (across, downward, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
+            axes = rows[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
             shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
             axes.tick_params(labelsize=7)
             axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
             if j == 0:
-                axes.set_ylabel(downwards(down, unit), fontsize=8)
+                axes.set_ylabel(downwards(downward, unit), fontsize=8)
                 cut = first.coordinates()[i][at[i]]
                 text = axes.text(0.02, 0.04, f"{'zyx'[i]} = {cut:.3g} {unit}", fontsize=7, transform=axes.transAxes)
                 text.set_bbox({"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5})
@@ -156,8 +159,7 @@ def orthogonal_slices(
                 axes.tick_params(labelleft=False)
             if i == 0:
                 axes.set_title(name, fontsize=11)
-    bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
-    bar.set_label(kind.label(unit))
+    add_bar(figure, shown, kind.label(unit))
     return png(figure)
 
 
@@ -199,8 +201,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
     angle = math.atan2(down[y, x], across[y, x])
     t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
-    figure = new_figure((WIDTH, 3.2))
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = panels([3.27, 3.27], [2.35], gap=_LEFT)
     for name, volume in volumes.items():
         at = (y + t * math.sin(angle), x + t * math.cos(angle))
         line = ndimage.map_coordinates(volume.data[z], at, order=1, mode="constant", cval=np.nan)
@@ -289,7 +290,7 @@ def round_length(length: float) -> float:
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
-    figure, axes = one_panel(2.8)
+    figure, ((axes,),) = panels([WIDTH - _LEFT - _GAP], [1.95])
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
     axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
@@ -348,6 +349,37 @@ def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = 
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, dpi=dpi, layout="constrained" if constrained else None)
+
+
+def panels(
+    across: Sequence[float], down: Sequence[float], dpi: float = DPI, *, gap: float = _GAP, right: float = _GAP
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure whose panels [row][column] have places of their own, with room of one size for their labels.
+
+    A layout that measures labels takes as long as all that is drawn.
+
+    Args:
+        across, down: widths and heights of the panels, inches.
+        gap, right: between columns, and on the right of the last, inches; BAR: room for a bar of colours.
+    """
+    width = _LEFT + sum(across) + gap * (len(across) - 1) + right
+    height = _TOP + sum(down) + _BELOW * len(down)
+    figure = new_figure((width, height), dpi, constrained=False)
+    lefts = [_LEFT + sum(across[:j]) + gap * j for j in range(len(across))]
+    bottoms = [height - _TOP - sum(down[: i + 1]) - _BELOW * i for i in range(len(down))]
+    return figure, [
+        [figure.add_axes((left / width, bottom / height, wide / width, high / height))
+         for left, wide in zip(lefts, across, strict=True)]
+        for bottom, high in zip(bottoms, down, strict=True)
+    ]  # fmt: skip
+
+
+def add_bar(figure: Figure, image: AxesImage, label: str) -> None:
+    """A bar of the colours of an image, in the room on the right of `panels`."""
+    width, height = figure.get_size_inches()
+    high = 0.8 * (height - _TOP - _BELOW)
+    place = (width - BAR + 0.12) / width, (_BELOW + high / 8) / height, 0.16 / width, high / height
+    figure.colorbar(image, cax=figure.add_axes(place), label=label)
 
 
 def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
