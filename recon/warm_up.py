@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ import numpy as np
 from numba.core import event
 
 from recon.base.arrays import F32
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, arrays_of
 from recon.base.method import DataUse, Method, ReconProblem
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name
@@ -66,7 +65,8 @@ def warm_up(
         # A fit may end with patches.
         for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
             toy, on = warmed.toy(), device if warmed is method else "cpu"
-            if (key := (type(toy), repr(toy), pickle.dumps(views), on, weighted)) not in _RECONSTRUCTED:
+            where = str([value.tolist() for value in arrays_of(views).values()])
+            if (key := (type(toy), repr(toy), where, on, weighted)) not in _RECONSTRUCTED:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # of a toy nobody needs to be warned
                     reconstruct(data, views, toy, device=on, use=DataUse(weights))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from graphlib import TopologicalSorter
 
 import grimp
 import pytest
 
-PACKAGES = ("beamline", "recon", "drivers", "simulators")
+from tests.features import PACKAGES, ROOT
+
 JUMPS = "beamline.projections.corrections.jumps.jumps"
 
 
@@ -24,3 +26,13 @@ def test_no_module_imports_one_that_imports_it(imported: dict[str, set[str]]) ->
 
 def test_imports_in_functions_and_for_types_count(imported: dict[str, set[str]]) -> None:
     assert {"beamline.projections.correction", "beamline.projections.usable_views"} <= imported[JUMPS]
+
+
+def test_nothing_is_pickled() -> None:
+    """But for numba's own files of compiled kernels."""
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            pickles = re.search(
+                r"(?m)^\s*(import|from) (pickle|dill|joblib|shelve)\b", path.read_text(encoding="utf-8")
+            )
+            assert not pickles or path.parent == ROOT / "recon/compiled", path

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
+from beamline.config.beam import NoMonochromator
 from beamline.config.load import Config, changed, load, override_of
-from beamline.config.monochromator import NoMonochromator
 from beamline.core.errors import ConfigError, ScanStopped, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence

@@ -13,12 +13,11 @@ import numpy as np
 from beamline.config.load import load, override_of
 from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import DataError, refuse_wrong_arguments
-from beamline.core.files import parts_of
+from beamline.core.files import SCAN, parts_of
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
 from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
-from beamline.scan.run_folder import SCAN
 from beamline.scan.runs import describe
 from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file

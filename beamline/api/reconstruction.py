@@ -14,8 +14,7 @@ from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
 from beamline.core.narration import sentence
 from beamline.core.stop import StopOnSignal
-from beamline.energies.scans import EnergyScans
-from beamline.energies.spectra import read_spectra
+from beamline.energies.scans import EnergyScans, read_spectra
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths, report_beside

@@ -31,10 +31,10 @@ from ophyd_async.core import (
 from beamline.bluesky.documents import COLUMNS, file_url
 from beamline.config.load import Config, camera_settings
 from beamline.core.errors import InstrumentError
+from beamline.core.files import SCAN, create_run_folder
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.digest import digest
 from beamline.scan.preflight import scan_info
-from beamline.scan.run_folder import SCAN, create_run_folder
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import Frame, FrameKind

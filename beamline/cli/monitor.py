@@ -11,7 +11,7 @@ import click
 
 from beamline.cli.option_groups import DATA, Grouped, heading
 from beamline.cli.options import json_option, others, scan_argument, set_by, set_option, with_request
-from beamline.cli.scan_options import scan_options
+from beamline.cli.selection_options import scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Done, FrameFlagged, Sink, Warned

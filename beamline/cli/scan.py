@@ -246,9 +246,9 @@ def run_one(
 def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
     """The configuration of a series of energies: the given one, or that in its folder `run`; None: it is one scan."""
     from beamline.config.load import load
+    from beamline.core.files import CONFIG
     from beamline.scan.energies import is_series
     from beamline.scan.resume import require_same_config
-    from beamline.scan.run_folder import CONFIG
 
     if run is not None and not is_series(run):
         return None
@@ -342,7 +342,7 @@ def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, j
 
 
 def _results(result: RunResult) -> str:
-    from beamline.scan.run_folder import RECON
+    from beamline.core.files import RECON
     from beamline.storage.flag_legend import counted
 
     lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]

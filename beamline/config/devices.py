@@ -6,11 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from beamline.config.beam import BeamMonitorSection, NoBeamMonitor
-from beamline.config.monochromator import FoundMonochromator, HandMonochromator, NoMonochromator, SceneMonochromator
+from beamline.config.beam import (
+    BeamMonitorSection,
+    FoundMonochromator,
+    FoundShutter,
+    HandMonochromator,
+    NoBeamMonitor,
+    NoMonochromator,
+    SceneMonochromator,
+    StageOutputShutter,
+)
 from beamline.config.places import FoundFilter, MotorFilter, MotorSection, NamedFilter, NoFilter, StageMover
 from beamline.config.section import Section, declared, read_from, section_of
-from beamline.config.shutters import FoundShutter, StageOutputShutter
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
+from beamline.config.beam import Kev, NoMonochromator
 from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection, ReferencesSection
-from beamline.config.monochromator import Kev, NoMonochromator
 from beamline.config.section import Section
 from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place

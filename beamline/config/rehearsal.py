@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from beamline.config.beam import NoBeamMonitor
+from beamline.config.beam import NoBeamMonitor, NoMonochromator, StageOutputShutter
 from beamline.config.devices import DeviceSection, SimulatedOrca
 from beamline.config.models import Config
-from beamline.config.monochromator import NoMonochromator
 from beamline.config.places import MotorSection, NoFilter
 from beamline.config.section import Section
-from beamline.config.shutters import StageOutputShutter
 from beamline.config.stages import StageSection
 from drivers.orca_quest import SENSOR_SHAPE
 

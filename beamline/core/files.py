@@ -10,12 +10,14 @@ import platform
 import shutil
 import stat
 import sys
+import time
 import uuid
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO
+from typing import BinaryIO, TextIO
 
 from beamline.core.errors import DataError, out_of_memory
 
@@ -25,6 +27,21 @@ RUNS = "runs"  # The default folder for the folders of runs
 SCAN, RECON, REPORT = "scan.h5", "recon.h5", "report.html"  # Files in the folder of a run
 CONFIG = "config.resolved.yaml"
 EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
+USER_LOG, RECON_LOG = "user.log", "recon.log"
+CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
+STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, before "_"
+
+
+def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
+    """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
+    stem = f"{time.strftime(STAMP, time.gmtime(seconds))}_{sample}"
+    runs.mkdir(parents=True, exist_ok=True)
+    for number in count(1):
+        folder = runs / (stem if number == 1 else f"{stem}-{number}")
+        with suppress(FileExistsError):
+            folder.mkdir(mode=OURS)
+            break
+    return folder
 
 
 def parts_of(run: Path) -> list[Path]:
@@ -319,3 +336,14 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_log(path: Path) -> Iterator[TextIO]:
+    """A new text file. An error when it is closed (full disk) is ignored: it must not replace the run's own error."""
+    file = path.open("x", encoding="utf-8")
+    try:
+        yield file
+    finally:
+        with suppress(OSError):
+            file.close()

@@ -15,12 +15,16 @@ from typing import TYPE_CHECKING, Self
 
 import click
 
-from beamline.config.beam import BeamMonitorSection
+from beamline.config.beam import (
+    BeamMonitorSection,
+    FoundMonochromator,
+    FoundShutter,
+    NoMonochromator,
+    StageOutputShutter,
+)
 from beamline.config.devices import DcamOrca, SimulatedOrca
 from beamline.config.load import Config, camera_settings
-from beamline.config.monochromator import FoundMonochromator, NoMonochromator
 from beamline.config.places import FoundFilter, MotorFilter, NoFilter, StageMover
-from beamline.config.shutters import FoundShutter, StageOutputShutter
 from beamline.core.errors import ConfigError
 from beamline.instrument.operator import ask_operator
 from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_beam_monitor, simulated_devices

@@ -13,13 +13,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.beam import BeamMonitorSection
+from beamline.config.beam import BeamMonitorSection, SceneMonochromator, StageOutputShutter
 from beamline.config.devices import SimulatedOrca
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
-from beamline.config.monochromator import SceneMonochromator
 from beamline.config.places import MotorFilter, NoFilter, StageMover
-from beamline.config.shutters import StageOutputShutter
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest

@@ -24,7 +24,6 @@ from beamline.monitor.references import (
     BRIGHT,
     CHANGE_SIGMAS,
     UNLIT,
-    WORST,
     FaultKind,
     Group,
     GroupVerdict,
@@ -32,6 +31,8 @@ from beamline.monitor.references import (
     ReferenceFrame,
     ReferenceLimits,
     is_blank,
+    saturation_limit,
+    worst_place,
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import MEDIAN
@@ -101,14 +102,15 @@ def _unusable(
     for group in groups:
         least = min(frame.invalid for frame in group)
         hot = 0.0 if not darks else float(np.median([dark.saturated for each in darks for dark in each]))
-        some = min(frame.saturated for frame in group) - hot <= limits.saturated  # else `judge` has the fault of all
+        limit = saturation_limit(group[0], limits)
+        some = min(frame.saturated for frame in group) - hot <= limit  # else `judge` has the fault of all
         for frame in group:
             if frame.invalid > least + INVALID:
                 sentence = f"a share of {{figures}} of the pixels is not finite (limit {least + INVALID:.3g})."
                 odd.append(OddFrame(frame, FaultKind.NOT_FINITE, frame.invalid, least + INVALID, sentence))
-            elif darks is not None and some and frame.saturated - hot > limits.saturated:
-                sentence = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
-                odd.append(OddFrame(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, sentence))
+            elif darks is not None and some and frame.saturated - hot > limit:
+                sentence = f"a share of {{figures}} of the pixels is saturated (limit {limit:.3g})."
+                odd.append(OddFrame(frame, FaultKind.SATURATED, frame.saturated - hot, limit, sentence))
     first_of_row = {each.frame.row: each for each in reversed(odd)}
     return list(reversed(first_of_row.values()))
 
@@ -152,7 +154,7 @@ def _changed(
         ratio = np.stack([each[lit] / usual[lit] for each in light])
         levels = np.nanmedian(ratio, axis=1)
         local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
-        place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
+        place = worst_place(np.nan_to_num(local))
         noise = float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1))) / MEDIAN
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2

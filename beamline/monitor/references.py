@@ -31,6 +31,7 @@ ZINGER = 12.0  # times the median change: more is not noise
 BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
 CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
 WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
+ZINGERS = 2  # places or pixels of a frame that they hit, however small it is
 
 
 @dataclass(frozen=True)
@@ -229,17 +230,28 @@ def full_scale(largest: float) -> float:
 
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    if all(_of_one_number(frame) for frame in (*flats, *(darks or ()))):
-        return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
+    if all(map(_of_one_number, flats)):
+        if all(map(_of_one_number, darks or ())) or not flats[0].rounding:
+            return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
+        sentence = (
+            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there, and the "
+            "light is not known. Shorten the exposure, or look for what cut the counts off."
+        )
+        return ReferenceFault(FaultKind.SATURATED, 1.0, limits.saturated, sentence)
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
-    score = float(np.median([flat.saturated for flat in flats])) - hot
-    if score <= limits.saturated:
+    score, limit = float(np.median([flat.saturated for flat in flats])) - hot, saturation_limit(flats[0], limits)
+    if score <= limit:
         return _clipped(flats, darks, limits)
     sentence = (
-        f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
+        f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known. "
         "Shorten the exposure or add a filter."
     )
-    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, sentence)
+    return ReferenceFault(FaultKind.SATURATED, score, limit, sentence)
+
+
+def saturation_limit(frame: ReferenceFrame, limits: ReferenceLimits) -> float:
+    """Fraction of the pixels of a frame that may be saturated."""
+    return max(limits.saturated, ZINGERS / (frame.blocks.size * frame.block**2))
 
 
 def _of_one_number(frame: ReferenceFrame) -> bool:
@@ -319,7 +331,7 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     local = np.abs(ratio / levels[:, None] - 1)
     noise = median_deviation(local)
     level = float(np.ptp(levels))
-    place = float(np.percentile(local, WORST, axis=1).max())
+    place = float(worst_place(local).max())
     if level > limits.uneven:
         sentence = (
             f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
@@ -332,6 +344,12 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
         )
         return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, sentence)
     return None
+
+
+def worst_place(changes: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The change [frame] that counts of those of its places [frame, place]: few of these may be zingers."""
+    n = changes.shape[1]
+    return np.sort(changes, axis=1)[:, max(0, n - 1 - max(ZINGERS, round(n * (1 - WORST / 100))))]
 
 
 def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:

@@ -43,6 +43,8 @@ class Recording:
 
     def __init__(self, path: Path, alone: bool = False) -> None:
         self.path = path
+        if not alone and path.is_file() and path.stat().st_size and not hdf5.is_hdf5(path):
+            raise _foreign(path)
         with hdf5.opened_itself(path) if alone else nullcontext():
             self._file = hdf5.open_hdf5(path, follow=True)
         try:
@@ -50,7 +52,7 @@ class Recording:
                 require_inside(self._file)
             with hdf5.readable(path):
                 if layout.COMMITTED not in self._file:
-                    raise DataError(f"{path} is no scan of this program: `beamline ingest` makes one of it.")
+                    raise _foreign(path)
                 self._data: h5py.Dataset = self._file[layout.DATA]
                 self._preview: h5py.Dataset = self._file[layout.PREVIEW]
                 self.shape = (int(self._data.shape[1]), int(self._data.shape[2]))
@@ -202,6 +204,13 @@ class Recording:
         for row in rows:
             total += self._data[int(row)]
         return total / np.float32(rows.size)
+
+
+def _foreign(path: Path) -> DataError:
+    return DataError(
+        f"{path} was not written by `beamline scan`, so that there is nothing to follow: `beamline view {path}` shows "
+        f"what it holds, and `beamline recon {path}` reconstructs a scan."
+    )
 
 
 def _json_number(value: Any) -> float | None:

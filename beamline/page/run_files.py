@@ -15,10 +15,9 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.events import LARGEST_LOG, event_in
-from beamline.core.files import EVENTS, is_below, open_below, parts_of, require_below, run_of
+from beamline.core.files import EVENTS, RECON, SCAN, is_below, open_below, parts_of, require_below, run_of
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, VolumeFile, newest
-from beamline.scan.run_folder import RECON, SCAN
 from beamline.scan.runs import DIED
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
@@ -58,7 +57,10 @@ def watched(path: Path) -> Watched:
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
-            raise DataError(f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file.")
+            raise DataError(
+                f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file; `beamline "
+                f"view {path}` shows images."
+            )
         return Watched(folder / SCAN, folder)
     if not path.is_file():
         raise DataError(f"{path} is not there.")

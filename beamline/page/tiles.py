@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
 from starlette.responses import Response
+
+from beamline.core.errors import DataError
 
 MOST = 1024
 """Pixels that a tile has along an axis, at most."""
@@ -96,6 +99,15 @@ def number_of(request: Request, name: str) -> int:
     """A whole number of a query; 0 where it is not that."""
     given = request.query_params.get(name, "0")
     return int(given) if given.isdecimal() and len(given) < 10 else 0
+
+
+def numbers_of(request: Request, name: str, n: int, what: str) -> list[float]:
+    """`n` real numbers of a query. DataError where it is not that; it says `what` was expected."""
+    with suppress(ValueError):
+        numbers = [float(word) for word in request.query_params.get(name, "").split(",")]
+        if len(numbers) == n and all(abs(each) < 1e6 for each in numbers):
+            return numbers
+    raise DataError(f"The query lacks {name}={what}.")
 
 
 def region_of(request: Request) -> TileRegion:

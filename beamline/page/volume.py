@@ -200,15 +200,26 @@ class ShownVolume:
         held: bytes of the copy of a file without scales, see `slices_of`.
         fbp: the FBP that is kept beside a volume (`has_fbp`), instead of the volume.
         dataset: an array in a file with several; None: the volume.
+        record: what is shown instead of a volume in the file, whose voxels are sliced along z.
 
     Raises:
         DataError: it cannot be read, or holds no volume.
     """
 
-    def __init__(self, path: Path, held: int = HELD, fbp: bool = False, dataset: str | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        held: int = HELD,
+        fbp: bool = False,
+        dataset: str | None = None,
+        record: ReconRecord | None = None,
+    ) -> None:
         with ExitStack() as opened:
-            seconds = () if dataset is not None else times_of(path)
-            record = opened.enter_context(opened_reconstruction(path, 0) if seconds else opened_volume(path, dataset))
+            seconds = () if dataset is not None or record is not None else times_of(path)
+            if record is None:
+                record = opened.enter_context(
+                    opened_reconstruction(path, 0) if seconds else opened_volume(path, dataset)
+                )
             self.path, self._grid, self.has_fbp = path, record.volume.grid, record.fbp is not None
             values: Any = record.volume.data
             self._name = path.name if dataset is None else f"{path.name}::{dataset}"
@@ -234,7 +245,7 @@ class ShownVolume:
 
     def facts(self) -> dict[str, Any]:
         """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, views, angles of
-        the views that a sector lacks, windows of all times."""
+        the views that are the slices (empty: it is a volume) and of those that a sector lacks, windows of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {
@@ -246,6 +257,7 @@ class ShownVolume:
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
             "because": str(self._parameters.get("chosen_because", "")),
+            "angles": [float(each) if np.isfinite(each) else None for each in self._parameters.get("angles_deg", ())],
             "unseen_deg": np.asarray(self._parameters.get("unseen_deg", ()), np.float64).tolist(),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,

@@ -14,7 +14,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
-from beamline.projections.usable_views import UsableViews
+from beamline.projections.usable_views import UsableViews, longest_part
 from beamline.storage.readers.base import ScanSource
 from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
@@ -22,7 +22,6 @@ from recon.base.masks import areas
 from recon.base.views import spread, spread_views
 from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, closest_pair, find_axis
 from recon.prep.correct import Projections
-from recon.prep.jump_parts import longest_part
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
 from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.light import WARN, light_beside_flats
+from beamline.storage.rules.light import WARN, darks_beside_views, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.noise import NOISE_VIEWS, noise_level
@@ -37,8 +37,8 @@ _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: D
 _FEW = 0.2  # of the views: so many are named, however far they are off
 _AXES_AGREE = 0.75  # columns, as for a pair of opposite views
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
-_TURNED, _TURNED_SIGMAS = np.radians(5.0), 6.0  # of the error of angles along a scan
-_TURNED_LEFT = 0.9  # of the variance of moments: at angles that are wrong, others explain it; a tooth leaves 0.96
+_TURNED, _TURNED_SIGMAS = np.radians(4.0), 9.0  # of errors of angles along a scan; 240 scans at rest have up to 8.8
+_TURNED_LEFT = 0.95  # of the variance of moments: at angles that are wrong, others explain it; a tooth leaves 0.96
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral
 _AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
@@ -114,7 +114,7 @@ def compare_with_flats(
     """
     if source.quantity != "counts" or not len(projections.data):
         return {}
-    accepted = selection.step(ReferenceCheck).accepted
+    accepted = selection.step(Preparation).accepted
     said = selection.step(Air).model != "auto"  # columns that are said to be air
     groups = groups_taken(source) if accepted else reference_groups(source).good()
     if not (groups.darks and groups.flats):
@@ -125,7 +125,8 @@ def compare_with_flats(
         columns = [np.median(projections.data[view], axis=0) for view in _evenly(len(projections.data), _COLUMN_VIEWS)]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in light_beside_flats(source, groups, level, air, accepted or said or not refused):
+    found = light_beside_flats(source, groups, level, air, accepted or said or not refused)
+    for finding in (*darks_beside_views(source, groups, accepted or not refused), *found):
         refuse(source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}

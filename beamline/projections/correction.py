@@ -14,14 +14,14 @@ from scipy import ndimage
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
-from beamline.projections.corrections.counts import CountModel
-from beamline.projections.corrections.flags import Flags, gap_sentence
-from beamline.projections.corrections.references import current_scale, use_current
+from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.corrections.references import current_scale
 from beamline.projections.filters import ViewFilters
 from beamline.projections.open_beam import OpenBeam, count_references
 from beamline.projections.read import read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
+from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.rules.unlit import ViewLight
@@ -56,7 +56,7 @@ class ScanCorrection:
         self._filters = ViewFilters.of(source, selection)
         self.rows, self.binning = self._filters.rows, selection.binning
         if self._filters.filters:
-            selection = selection.with_steps(CountModel("log"))
+            selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
         self._source, self._selection, self._warn = source, selection, warn
         if source.altered:
             warn(altered_sentence(source))
@@ -64,9 +64,9 @@ class ScanCorrection:
         self._shadow: Mask | None = None  # [row, col] of the rows read, binned; None: not looked for
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
-        elif selection.step(CountModel).noise == "counts":
+        elif selection.step(Preparation).noise == "counts":
             raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
-        elif use_current(selection):
+        elif selection.step(Preparation).by_current:
             current_scale(source)  # refuses a file without any
         self._told: set[int] = set()  # views without light that were named
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
@@ -184,8 +184,8 @@ class ScanCorrection:
     @property
     def done(self) -> dict[str, StepDone]:
         """What each step did, by name."""
-        nothing = {name: StepDone(parameters={}) for name in ("flats", "defects", "noise")}
-        return {**(nothing if self._beam is None else self._beam.done), **self._filters.done}
+        asked = self._selection.step(Preparation)
+        return {asked.name: asked.done, **(self._beam.done if self._beam else {}), **self._filters.done}
 
     @property
     def outdated(self) -> bool:
@@ -253,9 +253,15 @@ class ScanCorrection:
             )
 
     def _no_view(self) -> NoViewError:
+        beside_flats = (
+            ""
+            if self._light.flat is None
+            else f" The brightest have {self._light.usual:.2g} of the flats' light. Where views were divided by their "
+            "flats already, say --quantity transmission, or line-integrals."
+        )
         return NoViewError(
             f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
-            "light, or differ from their checksums."
+            f"light, or differ from their checksums.{beside_flats}"
         )
 
     def _tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
@@ -305,7 +311,7 @@ class ScanCorrection:
             lines = correction.line_integrals(views, last, lambda done: progress((2 * n + done) // _STEPS, n))
             return self._filters.apply(lines, rows)
         except UnlitViewsError as error:
-            judged = self._selection.step(Flags).judged
+            judged = self._selection.step(Preparation).judged
             advice = "" if judged else " (--flags judge leaves out what the monitor finds dark)"
             raise DataError(
                 f"{self._refusal(error)}{advice}; if the sample covers these columns, --air none"

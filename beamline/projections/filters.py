@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, rows_of
@@ -44,7 +44,7 @@ class ViewFilters:
         rows = rows_of(source, selection)
         outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
-        if filters and selection.step(CountModel).noise == "counts":
+        if filters and selection.step(Preparation).noise == "counts":
             raise ConfigError(
                 f"{filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
             )

@@ -7,15 +7,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import Defects, noise_sentence, photons_of
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
-    Flats,
-    ReferenceCheck,
     flats_sentence,
     read_references,
-    use_current,
     view_scale,
     warn_of_parts_without_flats,
     with_dynamic_flats,
@@ -27,6 +25,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
+from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import Correction, CorrectionSettings, References
 from recon.prep.counts import Photons
 from recon.prep.defects import SHADOW_REACH, shadowed
@@ -46,7 +45,7 @@ class OpenBeam:
             median ring current; None: all views are alike.
         n_references: darks and flats that the file had.
         used: those that are used.
-        done: results of its steps, by name of the step.
+        done: what flats, defects and noise came to, by these names.
     """
 
     references: References
@@ -70,29 +69,28 @@ class OpenBeam:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
             DataError: references that cannot be used.
         """
-        light = view_scale(source, use_current(selection))
-        n, accepted = count_references(source), selection.step(ReferenceCheck).accepted
-        used = groups_taken(source) if accepted else reference_groups(source).good()
+        asked = selection.step(Preparation)
+        light, n = view_scale(source, asked.by_current), count_references(source)
+        used = groups_taken(source) if asked.accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
-        if selection.step(Flats).fields == "dynamic":
+        if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
         tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
         warn_of_parts_without_flats(source, references, warn)
         photons = photons_of(source, used, references, rows, selection)
-        defects = selection.step(Defects)
         settings = CorrectionSettings(
-            defects.floor,
-            defects.hot_threshold,
-            defects.zinger_threshold,
+            asked.floor,
+            asked.hot_threshold,
+            asked.zinger_threshold,
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_sentence(source, references, use_current(selection)), noise_sentence(references, photons)
+        flats, noise = flats_sentence(source, references, asked.by_current), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {
             "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),
+            "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
         return cls(references, settings, photons, light, n, used, done)
@@ -135,3 +133,79 @@ class OpenBeam:
 def count_references(source: ScanSource) -> int:
     """Darks and flats that the file has so far."""
     return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
+
+
+_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
+_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
+
+
+def photons_of(
+    source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
+) -> Photons | None:
+    """How the pixels of a scan count photons, as they are read (binned); None: their logarithms are to be taken.
+
+    The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
+    of the largest group of darks.
+
+    Raises:
+        ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
+            the open beam too many or too few for any detector.
+    """
+    from beamline.projections.read import read_binned, spoilt_frames
+    from recon.prep.counts import Photons, photon_transfer
+
+    model = selection.step(Preparation)
+    if model.noise == "log":
+        return None
+    binning = selection.binning
+    first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
+    middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
+    spoilt = spoilt_frames(source, not model.uses_flags)
+    flats, darks = (
+        read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
+        for groups in (used.flats, used.darks)
+    )
+    if model.gain is not None:  # a mean of n pixels has n times as many photons a count
+        light = _counts_of_light(references) * binning**2 / model.gain
+        low, high = _PHOTONS
+        if not low <= light <= high:
+            raise ConfigError(
+                f"--gain {model.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
+                f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
+            )
+        variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
+        photons = Photons(model.gain / binning**2, variance)
+    else:
+        try:
+            photons = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
+        except ValueError as error:
+            if model.noise == "auto":
+                return None
+            raise ConfigError(
+                f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
+            ) from error
+    # A mean of n frames has n times as many photons a count, too; flats and darks are single frames.
+    photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)
+    if model.noise == "auto" and not light_of(references, photons) < FEW_PHOTONS:
+        return None
+    return photons
+
+
+def light_of(references: References, photons: Photons) -> float:
+    """Photons in a pixel of the open beam, the median of the flats."""
+    return _counts_of_light(references) / photons.gain
+
+
+def _counts_of_light(references: References) -> float:
+    return float(np.median(references.flats[0][1] - references.dark))
+
+
+def noise_sentence(references: References, photons: Photons | None) -> str:
+    """How counts become line integrals, in words; empty where they are logarithms."""
+    if photons is None:
+        return ""
+    light, readout = light_of(references, photons), photons.variance**0.5
+    return (
+        f"Photons are counted: {light:.3g} a pixel in the open beam, {photons.gain:.3g} counts each, readout "
+        f"noise {readout:.3g} counts"
+    )

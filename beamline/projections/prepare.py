@@ -358,5 +358,5 @@ def report_defects(projections: Projections, warn: Warn) -> None:
     if projections.floored > 1e-3:
         warn(
             f"{projections.floored:.1%} of the pixels let less light through than the floor; their attenuation is at "
-            "least what the volume says."
+            "least what the volume says, unless the darks are too high."
         )

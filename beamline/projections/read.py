@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource, read_known
 
@@ -74,7 +74,7 @@ def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.in
             f"{source.unreadable[first]}"
         )
     damaged = np.isin(frames, sorted(source.damaged)) & ~lost
-    used = selection.step(Flags).used
+    used = selection.step(Preparation).uses_flags
     if damaged.any():
         taken = "left out" if used else "used as they are (--flags ignore)"
         warn(

@@ -6,12 +6,11 @@ from collections.abc import Iterable
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Note, Warn
-from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.poses import stated_poses
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import UsableViews
+from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import angle_order
 from beamline.storage.rules.finding import Finding
@@ -30,16 +29,15 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     Raises:
         DataError: it cannot be reconstructed; with every reason, and what to do about each.
     """
-    flags = selection.step(Flags)
-    judged = judged_flags(source) if flags.judged and source.finished else None
-    accepted = selection.step(ReferenceCheck).accepted
-    findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, accepted)]
-    if flags.used:
+    asked = selection.step(Preparation)
+    judged = judged_flags(source) if asked.judged and source.finished else None
+    findings = [*scan_findings(source), *scan_ended(source), *references_usable(source, asked.accepted)]
+    if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(source, findings)
-    usable = usable_views(source, flags.used, judged)
+    usable = usable_views(source, asked.uses_flags, judged)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:
@@ -57,6 +55,6 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
 
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
-    checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
+    checked = () if selection.step(Preparation).accepted else (references_usable,)
     rules = (quantity_stated, references_present, *checked)
     return [finding for rule in rules for finding in rule(source)]

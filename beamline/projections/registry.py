@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 REGISTRY: dict[str, str] = {
     "TiltAndLens": "resampling",
     "Air": "air",
-    "Flags": "flags",
-    "ReferenceCheck": "references",
-    "CountModel": "counts",
-    "Defects": "counts",
-    "Flats": "references",
+    "Preparation": "preparation",
     "PosesOfFile": "poses",
     "Width": "width",
     **in_folders("beamline.projections.corrections", "STEPS"),
@@ -89,10 +85,11 @@ def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
     """What the file of a volume records of the steps, by name."""
     records: dict[str, Value] = {}
-    for step in steps:
-        did = done.get(step.name, StepDone())
-        sentence = {f"{step.name}_said": did.sentence} if did.sentence else {}
-        records |= _options(step) | sentence if did.parameters is None else did.parameters
+    options = {step.name: _options(step) for step in steps}
+    for name in {**options, **done}:
+        did = done.get(name, StepDone())
+        sentence = {f"{name}_said": did.sentence} if did.sentence else {}
+        records |= options.get(name, {}) | sentence if did.parameters is None else did.parameters
     return records
 
 

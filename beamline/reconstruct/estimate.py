@@ -7,15 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from beamline.core.errors import DataError
-from beamline.core.need import Need
+from beamline.core.machine import Need
 from beamline.core.text import count, size
 from beamline.projections.prepare import require_usable
 from beamline.projections.selection import check_axis, cone_of
 from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.plan import planned
-from beamline.reconstruct.refusals import refuse_before_reading
+from beamline.reconstruct.plan import planned, refuse_before_reading
 from beamline.reconstruct.several_scans import SeveralScans
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text

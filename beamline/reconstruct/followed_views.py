@@ -15,10 +15,10 @@ from beamline.core.events import EnoughReached, Sink, StateEntered
 from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.flags import Flags, usable_views
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
-from beamline.projections.usable_views import UsableViews
+from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.projections.view_geometry import with_rays
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
@@ -87,7 +87,7 @@ class FollowedViews:
 
     def usable(self) -> UsableViews:
         """Those that are in the file and may be used."""
-        return usable_views(self.source, self.selection.step(Flags).used)
+        return usable_views(self.source, self.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """The frames of the selection among these, by their place among all views taken, which later ones keep."""

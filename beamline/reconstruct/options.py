@@ -145,7 +145,7 @@ class ReconOptions:
         if region is None:
             return self
         if isinstance(region, AroundSample):
-            from beamline.reconstruct.sample_box import box_around_sample
+            from beamline.reconstruct.region import box_around_sample
 
             region = box_around_sample(source, self.selection)
         selection = selection_around(source, self.selection, region, self.method.traits.halo)

@@ -93,7 +93,7 @@ def _summary(
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
     if price := price_text(made):
-        summary += f". The next dB: {price}"
+        summary += f". {price}"
     return summary + "."
 
 

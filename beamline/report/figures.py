@@ -29,6 +29,7 @@ _FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as
 WIDTH = 8.6  # inches; the report's column
 _PROFILE = 16.0  # voxels to either side of an edge
 _LEFT, _TOP, _BELOW, _GAP, BAR = 0.95, 0.35, 0.5, 0.15, 1.0  # inches around panels, between them, of a bar of colours
+_BESIDE = 0.5  # inches, of small labels
 _BESIDE_BAR = WIDTH - _LEFT - BAR
 _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
@@ -122,7 +123,8 @@ def orthogonal_slices(
     unit: str,
     kind: VoxelKind = VoxelKind.ATTENUATION,
 ) -> bytes:
-    """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
+    """A row of three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers
+    show them.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
 
@@ -138,28 +140,23 @@ def orthogonal_slices(
     at = bright_centre(list(volumes.values())[-1].data)
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     greys = matter_window(*(image for images in slices.values() for image in images))
-    heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
-    column = min((WIDTH - _LEFT - BAR) / len(volumes) - _GAP, 4.25, 12 / sum(heights))
-    down = [column * height for height in heights]
-    figure, rows = panels([column] * len(volumes), down, dpi_for(nx, column), right=BAR)
-    for j, (name, images) in enumerate(slices.items()):
-        for i, (image, (across, downward, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
-            axes = rows[i][j]
+    height = max(ny / nx, nz / nx, nz / ny, _THIN)
+    column = min((WIDTH - _BESIDE - BAR - 2 * _BESIDE) / 3, 12 / (height * len(volumes)))
+    down = [column * height] * len(volumes)
+    figure, rows = panels([column] * 3, down, dpi_for(nx, column), left=_BESIDE, gap=_BESIDE, right=BAR)
+    for row, (name, images) in zip(rows, slices.items(), strict=True):
+        for i, (axes, image, (across, downward, h_edges, v_edges)) in enumerate(
+            zip(row, images, planes(first), strict=True)
+        ):
             thin = image.shape[0] < _THIN * image.shape[1]
             shown = show_grey(axes, image, greys, (*h_edges, *v_edges), stretched=thin)
-            axes.tick_params(labelsize=7)
-            axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
-            axes.set_xlabel(f"{across} ({unit})", fontsize=8)
-            if j == 0:
-                axes.set_ylabel(downwards(downward, unit), fontsize=8)
-                cut = first.coordinates()[i][at[i]]
-                text = axes.text(0.02, 0.04, f"{'zyx'[i]} = {cut:.3g} {unit}", fontsize=7, transform=axes.transAxes)
-                text.set_bbox({"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5})
-            else:
-                axes.tick_params(labelleft=False)
-            if i == 0:
-                axes.set_title(name, fontsize=11)
-    add_bar(figure, shown, kind.label(unit))
+            axes.tick_params(labelsize=6)
+            axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
+            axes.set_xlabel(f"{across} ({unit})", fontsize=7, labelpad=1)
+            axes.set_ylabel(downwards(downward, unit), fontsize=7, labelpad=1)
+            place = f"{'zyx'[i]} = {first.coordinates()[i][at[i]]:.3g} {unit}"
+            axes.set_title(place if i else f"{name}, {place}", fontsize=8, pad=3)
+    add_bar(figure, shown, kind.label(unit), size=7)
     return png(figure)
 
 
@@ -352,7 +349,13 @@ def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = 
 
 
 def panels(
-    across: Sequence[float], down: Sequence[float], dpi: float = DPI, *, gap: float = _GAP, right: float = _GAP
+    across: Sequence[float],
+    down: Sequence[float],
+    dpi: float = DPI,
+    *,
+    left: float = _LEFT,
+    gap: float = _GAP,
+    right: float = _GAP,
 ) -> tuple[Figure, list[list[Axes]]]:
     """A figure whose panels [row][column] have places of their own, with room of one size for their labels.
 
@@ -360,26 +363,28 @@ def panels(
 
     Args:
         across, down: widths and heights of the panels, inches.
-        gap, right: between columns, and on the right of the last, inches; BAR: room for a bar of colours.
+        left, gap, right: beside the first column, between columns, and beside the last, inches; BAR: room for a bar.
     """
-    width = _LEFT + sum(across) + gap * (len(across) - 1) + right
+    width = left + sum(across) + gap * (len(across) - 1) + right
     height = _TOP + sum(down) + _BELOW * len(down)
     figure = new_figure((width, height), dpi, constrained=False)
-    lefts = [_LEFT + sum(across[:j]) + gap * j for j in range(len(across))]
+    lefts = [left + sum(across[:j]) + gap * j for j in range(len(across))]
     bottoms = [height - _TOP - sum(down[: i + 1]) - _BELOW * i for i in range(len(down))]
     return figure, [
-        [figure.add_axes((left / width, bottom / height, wide / width, high / height))
-         for left, wide in zip(lefts, across, strict=True)]
+        [figure.add_axes((at / width, bottom / height, wide / width, high / height))
+         for at, wide in zip(lefts, across, strict=True)]
         for bottom, high in zip(bottoms, down, strict=True)
     ]  # fmt: skip
 
 
-def add_bar(figure: Figure, image: AxesImage, label: str) -> None:
-    """A bar of the colours of an image, in the room on the right of `panels`."""
+def add_bar(figure: Figure, image: AxesImage, label: str, size: float = 10) -> None:
+    """A bar of the colours of an image, in the room on the right of `panels`; labels of `size` points."""
     width, height = figure.get_size_inches()
     high = 0.8 * (height - _TOP - _BELOW)
     place = (width - BAR + 0.12) / width, (_BELOW + high / 8) / height, 0.16 / width, high / height
-    figure.colorbar(image, cax=figure.add_axes(place), label=label)
+    bar = figure.colorbar(image, cax=figure.add_axes(place))
+    bar.set_label(label, fontsize=size)
+    bar.ax.tick_params(labelsize=size)
 
 
 def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:

@@ -91,17 +91,13 @@ def price_of_decibel(made: Reconstruction) -> NextDecibel | None:
 
 
 def price_text(made: Reconstruction) -> str:
-    """The time of the next dB as text; empty if it is not known."""
-    price, judged = price_of_decibel(made), residual_curve(history_arrays(made.history))
-    if price is None or judged is None:
+    """What a longer reconstruction would gain, as a sentence without its end; empty if it is not known."""
+    if (price := price_of_decibel(made)) is None:
         return ""
     by_others = price.of == "volume"
+    gain = "bring the volume 1 dB nearer to the sample" if by_others else "lower the misfit to the views by 1 dB"
     if not price.measurable:
-        of_what = "reach of what was measured" if by_others else f"the residual of {judged.views}"
-        return f"none {'in' if by_others else 'measurable in'} {of_what}"
+        return f"A longer reconstruction would hardly {gain}"
     high = f"to {duration_text(price.high)}" if math.isfinite(price.high) else "or far more"
-    span = f"{duration_text(price.low)} {high}"
-    source = "as longer fits gained on four other scans"
-    if not by_others:
-        source = f"from the residual of {judged.views} as it fell"
-    return f"about {duration_text(price.seconds)} more ({span}), {source}"
+    source = ", as longer fits did on four other scans" if by_others else ""
+    return f"About {duration_text(price.seconds)} more would {gain} ({duration_text(price.low)} {high}){source}"

@@ -85,7 +85,7 @@ def _decibels(
     if further is None or seconds.size == 0:
         return
     if not further.measurable:
-        axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
+        axes.text(0.97, 0.05, "longer: no further dB", ha="right", fontsize=8, transform=axes.transAxes)
         return
     note = f"next dB of the {further.of}: about {duration_text(further.seconds)} more"
     axes.text(0.97, 0.05, note, ha="right", fontsize=8, transform=axes.transAxes)

@@ -20,9 +20,8 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, Warned, event_in, whole_lines
-from beamline.core.files import EVENTS, open_below, parts_of, same_file
+from beamline.core.files import CONTROL, EVENTS, SCAN, open_below, parts_of, same_file
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 

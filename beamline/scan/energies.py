@@ -13,7 +13,7 @@ from pathlib import Path
 from beamline.config.load import Config, at_energies, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
-from beamline.core.files import write_whole
+from beamline.core.files import CONFIG, SCAN, create_run_folder, write_whole
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
@@ -30,7 +30,6 @@ from beamline.scan.resume import (
     recover_run,
 )
 from beamline.scan.run import run_scan
-from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
 from beamline.scan.runs import describe
 from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file

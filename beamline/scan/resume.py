@@ -17,10 +17,9 @@ import h5py
 
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import EVENTS, create_part, parts_of
+from beamline.core.files import CONFIG, EVENTS, SCAN, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
-from beamline.scan.run_folder import CONFIG, SCAN
 from beamline.storage import hdf5
 from beamline.storage.parts import (
     JOINED,

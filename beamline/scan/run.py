@@ -23,7 +23,7 @@ from beamline.core.errors import (
     user_message,
 )
 from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
-from beamline.core.files import EVENTS, REPORT
+from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.run_result import RunResult
@@ -36,7 +36,6 @@ from beamline.instrument.simulated import clock_of
 from beamline.plan.angles import Retake, spread
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
-from beamline.scan.beam_log import BeamLog, beam_log
 from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
@@ -44,9 +43,8 @@ from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Consequences, Recorder, frames_in_memory
 from beamline.scan.references import ReferenceReport
 from beamline.scan.resume import ResumableRun, other_devices
-from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
-from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, Supervision
+from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, BeamLog, Supervision, beam_log
 from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan

@@ -14,10 +14,9 @@ from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import event_in, whole_lines
-from beamline.core.files import EVENTS, is_below, open_below, parts_of
+from beamline.core.files import CONFIG, CONTROL, EVENTS, SCAN, STAMP, is_below, open_below, parts_of
 from beamline.core.text import one_line, size
 from beamline.scan.control import running, state_of
-from beamline.scan.run_folder import CONFIG, CONTROL, SCAN, STAMP
 from beamline.scan.states import State
 from beamline.storage.interrupted import next_step
 

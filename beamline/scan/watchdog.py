@@ -25,16 +25,15 @@ from pathlib import Path
 
 import psutil
 
+from beamline.config.beam import FoundMonochromator, FoundShutter
 from beamline.config.devices import Simple
 from beamline.config.load import Config, load
-from beamline.config.monochromator import FoundMonochromator
 from beamline.config.places import MotorSection
-from beamline.config.shutters import FoundShutter
 from beamline.core.events import Sink, Warned
+from beamline.core.files import CONFIG, WATCHDOG_LOG
 from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
-from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.base.clock import Clock, SystemClock
 from drivers.stages.shared import FOUND
 

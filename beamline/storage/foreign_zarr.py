@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import TEXT, bytes_below, require_below
 from beamline.core.machine import free_memory
-from beamline.storage.header import numbers_of, shape_of
+from beamline.storage.structure import numbers_of, shape_of
 
 _METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _FACTS = (*_METADATA, ".zattrs", ".zmetadata")

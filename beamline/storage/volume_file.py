@@ -19,7 +19,7 @@ from beamline.core.files import RECON
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
-from beamline.storage.header import PACKED, require_npy
+from beamline.storage.structure import PACKED, require_npy
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
 """mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""

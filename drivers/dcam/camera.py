@@ -10,7 +10,7 @@ from typing import Any
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from drivers.dcam import cooling
+from drivers.dcam import properties as cooling
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import BufFrame, CaptureMode, CaptureState, Error, Property
 from drivers.dcam.properties import Properties
@@ -162,7 +162,7 @@ class DcamCamera:
             self._free()
 
     def wait_until_cold(self, timeout: float, progress: cooling.Progress = lambda celsius, status: None) -> float:
-        """See `drivers.dcam.cooling.wait_until_cold`."""
+        """See `drivers.dcam.properties.wait_until_cold`."""
         self._require_open()
         return cooling.wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 

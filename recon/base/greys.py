@@ -54,7 +54,7 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
     """Ends of grey windows of a volume by their names, the first one first.
 
     "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen, "weak",
-    where it differs, to the least dense class. "all" holds all values but the last half per mille at each end.
+    where it differs, to the least dense class, or where all matter is a pin of metal to the rest of the values. "all" holds all values but the last half per mille at each end.
     """
     classes = [each for each in class_levels(values) if each.size]
     if not classes:
@@ -71,8 +71,8 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
             low = max(low, levels[0] - _BEYOND * (high - levels[0]))
         return apart(low, high + _BEYOND * (high - levels[top]))
 
-    windows = {"matter": window(top)}
-    if top > 1 and (weak := window(1))[1] < _WEAK * windows["matter"][1]:
+    windows, rare = {"matter": window(top)}, sum(map(len, classes[1:])) < _FREQUENT * sum(map(len, classes))
+    if (top > 1 or rare) and (weak := window(0 if rare else 1))[1] < _WEAK * windows["matter"][1]:
         windows["weak"] = weak
     low, high = np.percentile(np.concatenate(classes), _ALL).tolist()
     return windows | {"all": apart(low, high)}

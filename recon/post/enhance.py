@@ -18,7 +18,8 @@ _SAMPLE = 4_000_000  # voxels from which percentiles are computed
 def sample_circle(volume: F32) -> tuple[float, float, float]:
     """Centre (y, x) and radius of the sample seen along z, in voxels.
 
-    K-means divides the mean over z into two classes; the circle has the extent of the largest connected part.
+    K-means divides the root of the mean over z above its least value into two classes, so that a pin of metal is not
+    one of them; the circle has the extent of the largest connected part.
 
     Args:
         volume: [z, y, x], finite.
@@ -27,6 +28,7 @@ def sample_circle(volume: F32) -> tuple[float, float, float]:
         ValueError: the mean is the same everywhere.
     """
     mean = volume.mean(axis=0, dtype=np.float64)
+    mean = np.sqrt(mean - mean.min())
     parts, _ = ndimage.label(ndimage.binary_fill_holes(mean > k_means(mean.ravel(), 2).mean()))
     largest = np.bincount(parts.ravel())[1:].argmax() + 1
     rows, cols = np.nonzero(parts == largest)

@@ -171,15 +171,16 @@ class _Orders:
             of_axis.append(2 * (seen @ (_chebyshev(order, places + quarter) - _chebyshev(order, places - quarter))))
         return cls(moments, of_axis, (_ROUNDING * np.abs(seen).sum(axis=2).mean(axis=0)) ** 2)
 
-    def errors(self, angles: F64, basis: F64, every: int) -> tuple[F64, F64, float]:
+    def errors(self, angles: F64, basis: F64, every: int, alike: bool = False) -> tuple[F64, F64, float]:
         """Errors of the angles as shares of a basis [view, share], their standard deviations, and the variance that the
         moments have beside the polynomials of these angles, as a sum over orders and bands of shares of their own.
 
         Args:
             every: 2 for the multiples of the angle of the order's parity, 1 for all.
+            alike: how much orders disagree is uncertainty, too.
         """
         n, bands = basis.shape[1] + 1, self.rounding.size
-        normal, right, variances = np.zeros((bands, n, n)), np.zeros((bands, n)), 0.0
+        normal, right, variances = np.zeros((_ORDERS, bands, n, n)), np.zeros((_ORDERS, bands, n)), 0.0
         for order, (moment, of_column) in enumerate(zip(self.moments, self.of_axis, strict=True), 1):
             multiples = np.arange(order % every, order + 1, every)[:, None]
             cosines, sines = np.cos(multiples * angles), np.sin(multiples * angles)
@@ -191,16 +192,17 @@ class _Orders:
             effects -= np.stack([parts @ np.linalg.lstsq(parts, each, rcond=None)[0] for each in effects])
             rest = moment - parts @ shares
             variance = np.maximum((rest**2).sum(axis=0) / (len(angles) - parts.shape[1]), self.rounding)
-            normal += np.einsum("avb,cvb,b->bac", effects, effects, 1 / variance)
-            right += np.einsum("avb,vb,b->ba", effects, rest, 1 / variance)
+            normal[order - 1] = np.einsum("avb,cvb,b->bac", effects, effects, 1 / variance)
+            right[order - 1] = np.einsum("avb,vb,b->ba", effects, rest, 1 / variance)
             variances += float(variance.sum() / max(float((moment**2).mean(axis=0).sum()), 1e-30))
-        total, of_all = normal.sum(axis=0), right.sum(axis=0)
+        total, of_all = normal.sum(axis=(0, 1)), right.sum(axis=(0, 1))
         if np.linalg.matrix_rank(total) < n:
             return np.full(n - 1, np.nan), np.full(n - 1, np.nan), variances
         found, sigma = np.linalg.solve(total, of_all)[:-1], np.sqrt(np.diag(np.linalg.inv(total))[:-1])
-        if bands > 2:  # without each of the bands in turn, which disagree where the sample moves
-            without = np.linalg.solve(total - normal, (of_all - right)[..., None])[:, :-1, 0]
-            sigma = np.maximum(sigma, np.sqrt((bands - 1) * without.var(axis=0)))
+        for axis, parts in ((0, bands), (1, len(normal) if alike else 0)):
+            if parts > 2:  # without each in turn: bands disagree where the sample moves, orders where it hardens
+                without = np.linalg.solve(total - normal.sum(axis), (of_all - right.sum(axis))[..., None])[:, :-1, 0]
+                sigma = np.maximum(sigma, np.sqrt((parts - 1) * without.var(axis=0)))
         return found, sigma, variances
 
 
@@ -235,7 +237,7 @@ def _turned(bands: F64, angles: F64, axis_col: float) -> tuple[F64, float, float
     basis -= basis.mean(axis=0)
     sigma, before = np.full(knots - 1, np.nan), np.nan
     for _ in range(_ROUNDS):
-        found, sigma, variances = orders.errors(angles + turned, basis, 2)
+        found, sigma, variances = orders.errors(angles + turned, basis, 2, alike=True)
         before = variances if np.isnan(before) else before
         if not np.isfinite(found).all():
             return np.zeros(n), np.nan, 1.0

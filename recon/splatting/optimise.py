@@ -21,7 +21,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import morton_order
 from recon.splatting.problem import FitProblem, make_problem
 from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
-from recon.splatting.splat import voxelize
+from recon.splatting.splat import voxel_means
 
 NORMALISE = 100  # steps between two normalisations of the quaternions
 
@@ -277,10 +277,9 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
     return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
 
 
-def volume_of(state: FitState, grid: Grid, settings: FitSettings, backend: Backend[Any] | None = None) -> Volume:
-    """The model on a grid, 1/mm."""
-    gaussians = gaussians_of(state, backend)
-    return Volume(voxelize(gaussians, grid, truncation=settings.truncation).numpy(), grid)
+def volume_of(state: FitState, grid: Grid, views: Geometry, settings: FitSettings) -> Volume:
+    """The `voxel_means` of a model of these views, 1/mm."""
+    return Volume(voxel_means(gaussians_of(state), grid, views, truncation=settings.truncation).numpy(), grid)
 
 
 def _order(parameters: dict[str, F32]) -> NDArray[np.int64]:

@@ -104,6 +104,6 @@ class BetterVolume:
 
         errors = HeldOutErrors.of(problem.images, problem.geometry, held_out, render)
         if not errors.direct < errors.fit:
-            return cls(volume_of(state, grid, settings), False, errors)
+            return cls(volume_of(state, grid, problem.geometry, settings), False, errors)
         data = direct_volume(problem.images, problem.geometry, grid) * problem.scale
         return cls(Volume(data, grid), True, errors)

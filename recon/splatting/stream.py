@@ -284,7 +284,7 @@ class StreamingFit:
         """The current volume, 1/mm; all zero before the first model."""
         if self._state is None:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
-        return fit.volume_of(averaged(self._state), self._grid, self._settings)
+        return fit.volume_of(averaged(self._state), self._grid, self._template, self._settings)
 
     def shown(self) -> BetterVolume:
         """The volume that predicts views held out better: that of the model, or FBP of the views so far."""
@@ -350,7 +350,7 @@ class StreamingFit:
             model = averaged(known)
             rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, range(self.n_views))))
             left = first_volume(data - rendered * self._problem.scale, geometry, rough)
-            volume = Volume(fit.volume_of(model, rough, self._settings).data + left.data, rough)
+            volume = Volume(fit.volume_of(model, rough, self._template, self._settings).data + left.data, rough)
             radius = math.inf if wider else geometry.reach
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, data, geometry)

@@ -14,7 +14,7 @@ from recon.kernels.cpu.patches import denoise, patch_scratch, pulled_step
 from recon.kernels.cpu.vectors import replace_by_residual
 from recon.voxels.resolution import smoothed
 from recon.voxels.sweeps import whitened
-from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
+from recon.voxels.voxel_problem import VoxelProblem
 
 TRIAL_STEPS = 15
 """Steps with patches. Without, with all 35: level within 0.1 dB, and half as much CPU time again."""
@@ -42,7 +42,7 @@ def pnp_dct(problem: VoxelProblem, x: F32, strength: float, *, steps: int) -> F3
         strength: last threshold, in the unit of the volume.
         steps: towards the views, five a round.
     """
-    bound = problem.decide("bound", lambda: largest_eigenvalue(problem.projector, problem.weight))
+    bound = problem.decide("bound", lambda: problem.norm)
     scratch, z, rounds = patch_scratch(x.shape), np.empty_like(x), -(-steps // STEPS)
     for k in range(rounds):
         threshold = strength * FALL ** (k - rounds)
@@ -89,6 +89,6 @@ def noise_of_volume(problem: VoxelProblem) -> float:
     alone = replace(problem, data=data, nonnegative=False, go_on=lambda *_: True)
     nz, ny, nx = problem.projector.grid.shape
     x, z = (np.zeros((ny, nx, nz), np.float32) for _ in range(2))
-    towards_views(alone, x, z, largest_eigenvalue(problem.projector, problem.weight), steps=STEPS)
+    towards_views(alone, x, z, problem.norm, steps=STEPS)
     noise = noise_beside_structure(whitened(problem.views, problem.weight), problem.projector.geometry)
     return noise * float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))

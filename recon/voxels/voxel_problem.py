@@ -48,6 +48,16 @@ class VoxelProblem:
     decide: Decisions = field(default_factory=Decisions)
     trial_goes_on: Callable[[], bool] = lambda: True
     measured: F32 | None = None
+    _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
+
+    @property
+    def norm(self) -> float:
+        """`largest_eigenvalue` of all views, computed once for all copies of the problem with their projector."""
+        for projector, weight, norm in self._norms:
+            if projector is self.projector and weight is self.weight:
+                return norm
+        self._norms.append((self.projector, self.weight, largest_eigenvalue(self.projector, self.weight)))
+        return self._norms[-1][-1]
 
     @property
     def views(self) -> F32:

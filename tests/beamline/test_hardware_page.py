@@ -11,9 +11,9 @@ import pytest
 from pydantic import BaseModel
 
 from beamline.cli.main import main
+from beamline.config.beam import StageOutputShutter
 from beamline.config.devices import DcamOrca
 from beamline.config.load import config_folder, load
-from beamline.config.shutters import StageOutputShutter
 from beamline.config.stages import STAGE_SECTIONS
 from beamline.scan.preflight import dry_run
 

@@ -18,9 +18,7 @@ import argparse
 import json
 import multiprocessing
 import os
-import pickle
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -142,10 +140,10 @@ def play(name: str, case: Case) -> list[Score]:
     return scores
 
 
-def _child(name: str, path: Path) -> list[Score]:
+def _child(name: str, case: Case) -> list[Score]:
     warnings.simplefilter("ignore")
     os.dup2(2, 1)  # what peers print does not belong in the table
-    return play(name, pickle.loads(path.read_bytes()))  # noqa: S301 - written by the parent
+    return play(name, case)
 
 
 def _cell(score: Score) -> str:
@@ -183,15 +181,12 @@ def main(arguments: Sequence[str]) -> None:
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:THREADS])
     kept = json.loads(asked.scores.read_text()) if asked.scores.exists() else {}
     for scan in asked.scans.split(";"):
-        case = SCANS[scan](DATA)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "case")
-            path.write_bytes(pickle.dumps(smaller(case) if asked.small else case))
-            for name in filter(lambda name: LEAGUE[name].is_installed, asked.of.split(";")):
-                with multiprocessing.get_context("spawn").Pool(1) as process:
-                    kept.setdefault(scan, {})[name] = process.apply(_child, (name, path))
-                print(scan, name, *kept[scan][name], file=sys.stderr, flush=True)
-                asked.scores.write_text(json.dumps(kept))
+        case = smaller(SCANS[scan](DATA)) if asked.small else SCANS[scan](DATA)
+        for name in filter(lambda name: LEAGUE[name].is_installed, asked.of.split(";")):
+            with multiprocessing.get_context("spawn").Pool(1) as process:
+                kept.setdefault(scan, {})[name] = process.apply(_child, (name, case))
+            print(scan, name, *kept[scan][name], file=sys.stderr, flush=True)
+            asked.scores.write_text(json.dumps(kept))
     order = [scan for scan in SCANS if scan in kept]
     print(table({scan: {name: [Score(*s) for s in some] for name, some in kept[scan].items()} for scan in order}))
 

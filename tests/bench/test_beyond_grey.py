@@ -21,9 +21,7 @@ from recon.assess.metrics import psnr
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.surfaces.gaussians import on_level
-from recon.features.surfaces.marching import half_way, surface
-from recon.features.surfaces.mesh import Mesh
+from recon.features.surfaces.marching import Mesh, half_way, on_level, surface
 from simulators.samples.materials.palette import known
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene

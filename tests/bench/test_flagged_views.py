@@ -18,8 +18,8 @@ from click.testing import CliRunner
 import recon
 from beamline.cli.main import main
 from beamline.config.load import config_folder
-from beamline.projections.corrections import flags
-from beamline.projections.corrections.flags import Flags
+from beamline.projections import usable_views as flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
@@ -87,8 +87,8 @@ def test_what_regions_of_flags_are_worth(tmp_path: Path, seed: int) -> None:
     with h5py.File(tmp_path / f"truth{seed}.h5") as file:
         truth = file["entry/data/data"][rows[0] // BIN : rows[1] // BIN]
     axis = (SIDE - 1) / 2 - 2.6
-    every = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Flags("ignore"),))
-    judged = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Flags("judge"),))
+    every = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Preparation("ignore"),))
+    judged = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Preparation("judge"),))
     print(f"\nseed {seed}: clean {psnr(clean, truth, every):.2f} dB")
     for fault in FAULTS:
         path = scan(tmp_path, fault, seed)

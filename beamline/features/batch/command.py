@@ -14,7 +14,7 @@ from beamline.cli.terminal import events_shown
 from beamline.core.errors import BeamlineError, DataError, ScanStopped
 from beamline.core.events import Done
 from beamline.core.files import RECON
-from beamline.core.need import Need
+from beamline.core.machine import Need
 from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
 from drivers.base.clock import SystemClock
 

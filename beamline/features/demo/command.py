@@ -98,10 +98,10 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         ConfigError: for a real instrument, where there is no truth.
         DataError: the live reconstruction failed; the scan is in its file.
     """
+    from beamline.core.files import RECON, RECON_LOG
     from beamline.instrument.connect import connect
     from beamline.scan.live_process import follow_command
     from beamline.scan.run import run_scan
-    from beamline.scan.run_folder import RECON, RECON_LOG
 
     clock = SystemClock()
     started = clock.now()

@@ -21,11 +21,12 @@ import psutil
 from beamline.config.devices import DcamOrca
 from beamline.features.doctor.check import Diagnosis, Grade, of_error
 from drivers.base.errors import DeviceError
-from drivers.dcam import usb
+from drivers.dcam import session as usb
 from drivers.serial.ports import SerialPort
 
 if TYPE_CHECKING:
     from drivers.dcam.abi import Dcam
+
 
 CONNECT_TIMEOUT = 2.0  # s for a TCP connection
 

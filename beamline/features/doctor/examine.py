@@ -16,11 +16,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from beamline.config.beam import BeamMonitorSection
+from beamline.config.beam import BeamMonitorSection, FoundMonochromator
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, FilterConfig, MonochromatorConfig
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
-from beamline.config.monochromator import FoundMonochromator
 from beamline.config.places import FoundFilter, MotorFilter
 from beamline.core.machine import free_memory
 from beamline.core.own_packages import OWN_PACKAGES, clashing_distributions

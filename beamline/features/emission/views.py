@@ -10,7 +10,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.refusals import checked_views
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
-from beamline.projections.step import StepDone
+from beamline.projections.step import StepDone, options_of
 from beamline.storage.readers.base import EmissionOf, ScanSource
 from recon.prep.correct import Projections
 from recon.prep.emission import Emission, weighted_lines
@@ -25,7 +25,8 @@ def prepare_emission(
         ConfigError: binning, columns or a correction, which are of views in transmission.
         DataError: the file's values are no counts, or nothing survives.
     """
-    asked = [f"the correction {step.name!r}" for step in selection.steps if step != type(step)()]
+    asked = [each.name for step in selection.steps for field, each in options_of(type(step)).items()
+             if getattr(step, field) != getattr(type(step)(), field)]  # fmt: skip
     asked += ["--bin"] * (selection.binning > 1) + ["--cols"] * (source.cols is not None)
     asked += ["a cone beam"] * (selection.cone is not None)
     if asked:

@@ -31,7 +31,11 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     from beamline.page.followed_run import PERIOD
 
     with closing(RunServer(runs, prefix, bind, control, say)) as server, suppress(KeyboardInterrupt):
-        click.echo(f"{prefix}ScanStatus and others at {bind} (docs/page.md). Ctrl-C ends this, not the scan.")
+        found = "by their broadcasts" if bind == "0.0.0.0" else f"with EPICS_PVA_ADDR_LIST={bind} in their environment"
+        click.echo(
+            f"{prefix}ScanStatus and others at {bind}; clients find them {found} (docs/page.md). Ctrl-C ends this, not "
+            "the scan."
+        )
         while True:
             server.look()
             time.sleep(PERIOD)

@@ -80,7 +80,7 @@ def _images(
         with opened_volume(file, *dataset) as record:
             yield slices_along(record, AXES.index(of), style.side)
         return
-    from beamline.features.export.view_film import views_by_angle
+    from beamline.features.export.film_file import views_by_angle
     from beamline.storage.readers.open import SourceOptions
 
     with SourceOptions(file, frames_per_view=None).open() as source:

@@ -11,7 +11,7 @@ import click
 
 from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
 from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
-from beamline.cli.scan_options import light_asked, light_options, scan_options
+from beamline.cli.selection_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
 from beamline.core.events import Done, RuleBroken

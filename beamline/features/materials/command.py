@@ -70,8 +70,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, **values: An
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
-    from beamline.energies.scans import EnergyScans
-    from beamline.energies.spectra import read_spectra
+    from beamline.energies.scans import EnergyScans, read_spectra
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.scan.energies import scans_of

@@ -26,7 +26,7 @@ from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
 
 if TYPE_CHECKING:
-    from recon.features.surfaces.mesh import Mesh
+    from recon.features.surfaces.marching import Mesh
 
 _TOGETHER = 2**16  # triangles or vertices
 
@@ -101,7 +101,7 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
 
     The mesh is watertight: matter that leaves the volume is closed at its faces. Nothing is overwritten.
     """
-    from beamline.features.models.surface import surface_of_gaussians, surface_of_volume
+    from beamline.features.models.made import surface_of_gaussians, surface_of_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})
     with events_shown(as_json) as sink:

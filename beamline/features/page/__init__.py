@@ -13,7 +13,7 @@ COMMANDS = {
     ),
     "view": CommandEntry(
         "beamline.features.page.view",
-        "Show one or two volumes in the browser: slices, histogram, profile, difference.",
+        "Show a scan, or one or two volumes, in the browser: slices, axis, histogram, profile, difference.",
         Libraries.FILES,
     ),
 }

@@ -17,7 +17,7 @@ from dataclasses import astuple, dataclass, field
 from functools import partial
 from importlib.resources import files
 from threading import Event
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -30,12 +30,15 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
 from beamline.core.files import bytes_below
-from beamline.features.page.viewer import reader_of, viewer_routes
+from beamline.features.page.viewer import reader_of, scan_routes, viewer_routes
 from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import number_of, region_of, tile_of
 from beamline.page.volume import ShownVolume
 from beamline.scan.control import POLL, Verb, ask
+
+if TYPE_CHECKING:
+    from beamline.page.shown_scan import ShownScan
 
 COOKIE = "splatline_look_"
 """Name of the cookie, before the port: a browser sends a cookie to all ports of a host."""
@@ -148,9 +151,10 @@ def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlett
     return guarded("index.html", page_routes(reader, access, log), access)
 
 
-def viewer(volumes: Sequence[ShownVolume], access: Access) -> Starlette:
-    """The application for one volume, or two to compare."""
-    return guarded("view.html", viewer_routes(reader_of(volumes)), access)
+def viewer(volumes: Sequence[ShownVolume], access: Access, scan: ShownScan | None = None) -> Starlette:
+    """The application for one volume, or two to compare, or for the stack of a scan's views."""
+    do = reader_of(volumes)
+    return guarded("view.html", viewer_routes(do) + ([] if scan is None else scan_routes(do, scan)), access)
 
 
 def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> list[BaseRoute]:

@@ -1,19 +1,23 @@
-"""Answers of the viewer: one or two volumes, slice by slice."""
+"""Answers of the viewer: one or two volumes, or a scan, slice by slice."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, replace
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import number_of, region_of, tile_of
+from beamline.page.tiles import bin_mean, number_of, numbers_of, region_of, tile_of
 from beamline.page.volume import ShownVolume, VolumeTile
+from recon.base.greys import grey_windows
+
+if TYPE_CHECKING:
+    from beamline.page.shown_scan import ShownScan
 
 _Result = TypeVar("_Result")
 
@@ -33,6 +37,17 @@ def viewer_routes(do: OnVolumes) -> list[Route]:
         Route("/api/difference/{axis:number}/{index:number}", server.difference),
         Route("/api/histogram/{which:number}", server.histogram),
         Route("/api/profile/{which:number}/{axis:number}/{index:number}", server.profile),
+    ]
+
+
+def scan_routes(do: OnVolumes, scan: ShownScan) -> list[Route]:
+    """What the page of a scan asks for beside the slices of its views."""
+    server = _Scan(do, scan)
+    return [
+        Route("/api/scan", server.facts),
+        Route("/api/mean/{kind}", server.mean),
+        Route("/api/axis/{row:number}", server.axis),
+        Route("/api/fbp/{row:number}", server.fbp),
     ]
 
 
@@ -84,12 +99,7 @@ class _Viewer:
 
     def profile(self, request: Request) -> Response:
         axis, index, time = _place(request)
-        try:
-            line = [float(word) for word in request.query_params.get("line", "").split(",")]
-            if len(line) != 4 or not all(abs(each) < 1e6 for each in line):
-                raise ValueError
-        except ValueError:
-            raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
+        line = numbers_of(request, "line", 4, "first row, first column, last row, last column")
         return JSONResponse(self._on(request, lambda volume: volume.profile(axis, index, line, time)))
 
     def _on(self, request: Request, read: Callable[[ShownVolume], _Result]) -> _Result:
@@ -101,6 +111,32 @@ class _Viewer:
             return read(volumes[which])
 
         return self._do(read_it)
+
+
+class _Scan:
+    def __init__(self, do: OnVolumes, scan: ShownScan) -> None:
+        self._do, self._scan = do, scan
+
+    def facts(self, request: Request) -> Response:
+        return JSONResponse(self._do(lambda _: self._scan.facts()))
+
+    def mean(self, request: Request) -> Response:
+        """A mean frame, binned to a tile."""
+        mean = self._do(lambda _: self._scan.mean(request.path_params["kind"]))
+        region = region_of(request).inside((mean.shape[0], mean.shape[1]))
+        factor = region.binning()
+        return tile_of(bin_mean(mean[region.slices], (factor, factor)), {"region": astuple(region), "bin": factor})
+
+    def axis(self, request: Request) -> Response:
+        return JSONResponse(self._do(lambda _: self._scan.axis(int(request.path_params["row"]))))
+
+    def fbp(self, request: Request) -> Response:
+        """A slice by FBP with an axis and a tilt; `fast`: while a slider moves."""
+        row, (axis, tilt) = int(request.path_params["row"]), numbers_of(request, "axis", 2, "column, degrees of tilt")
+        region, fast = region_of(request), number_of(request, "fast") > 0
+        tile = self._do(lambda _: self._scan.fbp(row, axis, tilt, region, fast=fast))
+        head = {"region": astuple(tile.region), "bin": tile.bin, "windows": grey_windows(tile.values)}
+        return tile_of(tile.values, head)
 
 
 def _place(request: Request) -> tuple[int, int, int]:

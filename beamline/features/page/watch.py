@@ -64,6 +64,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
         click.echo(advice, err=True)
     reader = Reader(what)
     try:
+        reader.state()  # refuses a scan of another program before a page shows nothing
         server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
         if tethered:

@@ -40,9 +40,8 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.option(
     "--crop",
     type=NameChoice(["square", "none"]),
-    default="square",
-    show_default=True,
-    help="square: the one inside the circle of the sample, without its wall; none: the whole volume.",
+    help="square: the one inside the circle of the sample, without its wall; none: the whole volume. Default: square, "
+    "unless it cuts half of the bodies or more.",
 )
 @click.option("--margin", type=FiniteRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
               help="Share of the square's side taken off at each end.")  # fmt: skip
@@ -74,7 +73,7 @@ _PERCENT = FiniteRange(min=0, max=100)
 def segment(
     volume: Path,
     voxel_um: float | None,
-    crop: str,
+    crop: str | None,
     margin: float,
     clusters: int | None,
     view: bool,
@@ -102,7 +101,8 @@ def segment(
         volume=volume,
         output=output,
         voxel_mm=None if voxel_um is None else voxel_um * 1e-3,
-        margin=margin if crop == "square" else None,
+        margin=None if crop == "none" else margin,
+        whole_if_cut=crop is None,
         n_clusters=clusters,
         command=repeating(click.get_current_context(), volume, output),
         **values,
@@ -122,12 +122,15 @@ def summary(result: Segmented, options: SegmentOptions) -> str:
     figures, unit = result.particles.statistics(), result.unit
     _, rows, cols = result.box
     crop = "none, the whole volume"
-    if options.margin is not None:
+    if options.whole_if_cut and result.margin is None:
+        crop += ": the square inside the circle of the sample cuts most bodies (--crop square takes it)"
+    if result.margin is not None:
         crop = (
             f"rows {rows.start}-{rows.stop - 1}, columns {cols.start}-{cols.stop - 1} of each slice: the square inside "
-            f"the circle of the sample, less {options.margin:.3g} of its side at each end (--crop none, --margin)"
+            f"the circle of the sample, less {result.margin:.3g} of its side at each end (--crop none, --margin)"
         )
     lines = [
+        f"{'of use':<12}{result.verdict}",
         f"{'labels':<12}{options.output}",
         f"{'table':<12}{options.table}",
         f"{'picture':<12}{options.picture}",

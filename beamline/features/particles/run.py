@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
 from beamline.core.shipped import version
+from beamline.core.text import count
 from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
@@ -49,6 +50,7 @@ class SegmentOptions:
         output: HDF5 file of the labels; the table and the picture lie beside it.
         voxel_mm: edge of a voxel where the file does not say it; None: as the file says, or 1 px.
         margin: of the square inside the sample's circle; None: the whole volume.
+        whole_if_cut: take the whole volume, too, where the square cuts half of the bodies or more.
         n_clusters: of grey values; None: by the elbow rule.
         neck: where touching particles are parted; 0: nowhere.
     """
@@ -58,6 +60,7 @@ class SegmentOptions:
     output: Path
     voxel_mm: float | None = None
     margin: float | None = 0.05
+    whole_if_cut: bool = False
     percentiles: tuple[float, float] = (0.5, 99.5)
     gamma: float = 1.0
     sigma: float = 0.7
@@ -90,6 +93,7 @@ class Segmented:
         particles: of the labels.
         volume_deviation: of each particle's volume; None where the file has no error bars.
         outside: bodies as bright as particles, and as large as the smallest, that lie outside the box; not the wall.
+        margin: as of the options, None also where the whole volume was taken instead.
     """
 
     box: Box
@@ -100,6 +104,23 @@ class Segmented:
     particles: Particles
     volume_deviation: NDArray[np.float64] | None = None
     outside: int = 0
+    margin: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the table is of use, and what to give where it is not."""
+        n, cut, k = self.particles.label.size, int(self.particles.cut.sum()), self.clusters.centres.size
+        other = "--clusters and --percentiles LOW HIGH take weaker matter"
+        if n == 0:
+            return f"no, nothing of the densest of {k} classes is as large as --smallest: {other}"
+        if 2 * cut > n:
+            whole = "" if self.margin is None else "--crop none takes the whole volume, "
+            return (
+                f"no, {cut} of {count(n, 'particle')} of the densest of {k} classes are cut by a face: {whole}{other}"
+            )
+        return f"yes, {count(n - cut, 'whole particle')} of the densest of {k} classes" + (
+            f"; {other}" if n == 1 else ""
+        )
 
 
 def segment(options: SegmentOptions) -> Segmented:
@@ -113,6 +134,10 @@ def segment(options: SegmentOptions) -> Segmented:
     volume, unit = _read(options)
     try:
         segmented = _segmented(volume, unit, options)
+        if options.whole_if_cut and 2 * segmented.particles.cut.sum() >= segmented.particles.cut.size:
+            whole = _segmented(volume, unit, replace(options, margin=None))
+            if whole.particles.cut.mean() < 0.5:  # NaN without any
+                segmented = whole
     except ValueError as error:
         raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
     written = list[Path]()
@@ -150,7 +175,7 @@ def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     if deviation is not None and deviation.shape == volume.data.shape:
         of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
         bars = volume_deviation(labels, grey, of_grey, greys.threshold) * np.prod(volume.grid.spacing)
-    return Segmented(box, volume, unit, labels, greys, particles, bars, outside)
+    return Segmented(box, volume, unit, labels, greys, particles, bars, outside, options.margin)
 
 
 def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
@@ -228,7 +253,7 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
     """Everything that the labels depend on, and the figures of all particles, by name."""
     low, high = options.percentiles
     return {
-        "margin": "none" if options.margin is None else options.margin,
+        "margin": "none" if found.margin is None else found.margin,
         "percentile_low": low, "percentile_high": high, "gamma": options.gamma, "sigma": options.sigma,
         "clusters": found.clusters.centres.size, "threshold": found.clusters.threshold, "radius": options.radius,
         "smallest": options.smallest, "neck": options.neck, "seed": options.seed,

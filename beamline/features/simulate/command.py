@@ -43,8 +43,7 @@ def simulate(request: SimulateRequest) -> None:
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
-    from beamline.features.simulate.scene import exposure_errors, scan_of
-    from beamline.features.simulate.write import check_output
+    from beamline.features.simulate.write import check_output, exposure_errors, scan_of
     from beamline.scenes.scene_file import feature_of, open_scene
 
     clock = SystemClock()
@@ -106,7 +105,7 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
 
 
 def _explain(scan: Scan, output: Output) -> None:
-    from beamline.features.simulate.scene import cost_table, frame_cost
+    from beamline.features.simulate.write import cost_table, frame_cost
 
     cost_of_frame, where = frame_cost(scan, time.perf_counter), machine()
     costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in cost_of_frame.costs]

@@ -6,12 +6,12 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from beamline.core.errors import DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import FrameStored, Sink
 from beamline.core.files import refuse_existing
 from beamline.core.machine_speed import seconds_left
@@ -25,6 +25,8 @@ from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.anomaly import Label
+from simulators.frame.shot import CannotExposeError
+from simulators.scenes.cost.explain import FrameCost, explain
 from simulators.scenes.expose import PlannedFrame, Scan, expose
 
 PREVIEW_BIN = 4
@@ -148,3 +150,40 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
             }
         },
     )
+
+
+def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
+    """The scan of a scene, see Scan.of. Its last frame is computed once, so that an impossible scene is refused here.
+
+    Raises:
+        CannotExposeError: the scene cannot be exposed with its settings.
+    """
+    scan = Scan.of(scene.scene, seed, views, start)
+    expose(scan.scene, scan.frame(len(scan) - 1).shot)
+    return scan
+
+
+@contextmanager
+def exposure_errors(scene: str) -> Iterator[None]:
+    """Within it a CannotExposeError becomes a ConfigError that names the scene."""
+    try:
+        yield
+    except CannotExposeError as error:
+        raise ConfigError(f"{scene} cannot be exposed: {error}.") from error
+
+
+def frame_cost(scan: Scan, now: Callable[[], float]) -> FrameCost:
+    """The cost of the view in the middle of the scan, where an anomaly is likeliest."""
+    return explain(scan.scene, scan.frame(len(scan) - 1 - scan.views // 2).shot, now)
+
+
+def cost_table(found: FrameCost) -> str:
+    """A line for each step, in order, and the effects that the scene does not name."""
+    lines = [f"{'step':<22}{'acts on':<15}{'ms/frame':>9}{'memory':>10}  what happens"]
+    for cost in found.costs:
+        domain = "" if cost.domain is None else cost.domain.words
+        lines.append(f"{cost.name:<22}{domain:<15}{cost.ms:>9.2f}{size(cost.size):>10}  {cost.summary}")
+    lines.append(f"{'a frame':<37}{found.ms:>9.2f}")
+    lines.append("\nNot named by the scene, hence neither imported nor computed:")
+    lines += [f"  {name:<20}{summary}" for name, summary in found.unused]
+    return "\n".join(lines)

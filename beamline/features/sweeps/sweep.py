@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
 from beamline.core.sinks import Warnings
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
+import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,13 +17,15 @@ from beamline.core.files import named_on_failure
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from recon.base.arrays import F32, F64, I64
-from recon.base.geometry import Geometry
-from recon.prep.emission import weighted_lines
+from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.base.method import Energies
+from recon.prep.correct import Projections
+from recon.prep.emission import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
-_VALUES, _REFERENCE, _REGIONS = "values.pickle", "reference_", "regions.npy"
-_SMALL = 4096  # bytes of an array that needs no file of its own
+_VALUES = "values.json"
+_SMALL = 4096  # bytes of a file that is read at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,49 +67,62 @@ class TrialData:
         return None if rays is None else rays[self.geometry.n_views :]
 
     def save(self, folder: Path) -> None:
-        """Into a new folder, each large array in a file of its own.
+        """Into a new folder: each array in a .npy file, numbers and words in one of JSON, without how it was prepared.
 
         Raises:
             DataError: the disk did not take it.
         """
+        views = self.prepared
+        parts: dict[str, Any] = {
+            "data": self, "prepared": views, "projections": views.projections, "emission": views.emission,
+            "energies": views.energies,
+        }  # fmt: skip
+        values = {
+            f"{part}.{each.name}": getattr(of, each.name) for part, of in parts.items() if of for each in fields(of)
+        }
+        values |= {f"geometry.{name}": value for name, value in arrays_of(self.geometry).items()}
+        if views.held_out is not None:
+            unseen = {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
+            values |= {"held_out.lines": views.held_out[0], **unseen}
+        plain = {name: value for name, value in values.items() if isinstance(value, str | float | int | np.generic)}
         with named_on_failure(folder):
             folder.mkdir()
-        arrays: dict[int, NDArray[Any]] = {}
-
-        def number_of(value: object) -> int | None:
-            """Of an array with a file of its own."""
-            if not isinstance(value, np.ndarray) or value.nbytes <= _SMALL:
-                return None
-            arrays[id(value)] = value
-            return id(value)
-
-        with named_on_failure(folder / _VALUES), (folder / _VALUES).open("wb") as file:
-            pickler = pickle.Pickler(file)
-            pickler.persistent_id = number_of  # type: ignore[method-assign]
-            pickler.dump(self)
-        for number, array in arrays.items():
-            write_array(folder / f"{number}.npy", array)
+            (folder / _VALUES).write_text(json.dumps(plain, default=np.generic.item), encoding="utf-8")
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                write_array(folder / f"{name}.npy", value)
 
     @classmethod
     def load(cls, folder: Path) -> TrialData:
         """What `save` of the same program wrote; large arrays stay in their files until they are used."""
-        with (folder / _VALUES).open("rb") as file:
-            unpickler = pickle.Unpickler(file)  # noqa: S301 - written by the process that started this one
-            unpickler.persistent_load = lambda number: np.load(folder / f"{number}.npy", mmap_mode="r")  # type: ignore[method-assign]
-            data: TrialData = unpickler.load()
-        made = {path.stem.removeprefix(_REFERENCE): np.load(path) for path in folder.glob(f"{_REFERENCE}*.npy")}
-        regions = folder / _REGIONS  # these were made after the others were saved
-        return replace(data, references=made, regions=np.load(regions) if regions.exists() else None)
+        values = json.loads((folder / _VALUES).read_text(encoding="utf-8")) | {
+            path.stem: np.load(path, "r" if path.stat().st_size > _SMALL else None) for path in folder.glob("*.npy")
+        }
+
+        def of(part: str) -> dict[str, Any]:
+            return {name.removeprefix(f"{part}."): v for name, v in values.items() if name.startswith(f"{part}.")}
+
+        geometry = geometry_of_arrays(of("geometry"))
+        prepared = PreparedProjections(
+            Projections(**of("projections")),
+            geometry,
+            axis=None,
+            held_out=(held["lines"], geometry_of_arrays(of("unseen"))) if (held := of("held_out")) else None,
+            emission=Emission(geometry=geometry, **counted) if (counted := of("emission")) else None,
+            energies=Energies(**energies) if (energies := of("energies")) else None,
+            **of("prepared"),
+        )
+        return cls(prepared, **{"truth": None, **of("data")}, references=of("reference"))
 
 
 def write_reference(folder: Path, method: str, volume: F32) -> None:
     """A volume that trials of the method are compared with, beside data that were saved."""
-    write_array(folder / f"{_REFERENCE}{method}.npy", volume)
+    write_array(folder / f"reference.{method}.npy", volume)
 
 
 def write_regions(folder: Path, regions: NDArray[np.int8]) -> None:
     """The dense and the empty regions, beside data that were saved."""
-    write_array(folder / _REGIONS, regions)
+    write_array(folder / "data.regions.npy", regions)
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
@@ -116,8 +131,7 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
     A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
     of an emission are added. A ray weighs as the least of its window.
     """
-    groups = choice.groups
-    assert groups is not None
+    groups = np.array(choice.groups)
     middle = prepared.of_views(groups[:, choice.window // 2])
     if choice.window == 1 and prepared.emission is None:
         return middle

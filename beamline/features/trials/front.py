@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from beamline.features.trials import pareto
+from beamline.features.trials import table as pareto
 from beamline.features.trials.figures import cost_curves, pareto_plot
 from beamline.features.trials.layout import TableColumn, TableLayout
 from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-import pickle
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
@@ -35,6 +36,10 @@ class TrialJob:
     seed: int = 0
     keep: Path | None = None
     compiled: Sequence[Trial] = ()
+
+
+JOB = TypeAdapter(TrialJob)
+"""Reads and writes a job as JSON."""
 
 
 def command(job: Path) -> Sequence[str]:
@@ -87,9 +92,9 @@ class _Ended:
 
 
 def _run(job: TrialJob, work: Path, max_seconds: float | None = None) -> _Ended:
-    path, log = work / "job.pickle", work / "stderr.txt"
+    path, log = work / "job.json", work / "stderr.txt"
     with named_on_failure(path):
-        path.write_bytes(pickle.dumps(job))
+        path.write_bytes(JOB.dump_json(job))
     last: dict[str, Any] = {}
 
     def remember(line: str) -> None:

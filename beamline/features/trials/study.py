@@ -101,7 +101,7 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
     for choice in choices:
         if choice.groups is None:
             warn(f"{choice.label} is left out: {choice.reason}")
-    whole = ViewChoice(REFERENCE, np.arange(geometry.n_views)[:, None])
+    whole = ViewChoice(REFERENCE, [[view] for view in range(geometry.n_views)])
     fbp = Trial("method", BASELINE, geometry.n_views, settings={"filter": options.filter}, choice=whole)
     others = (
         Trial("method", method, geometry.n_views, settings=dict(options.settings.get(method, {})), choice=whole)

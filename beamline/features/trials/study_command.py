@@ -27,8 +27,7 @@ from beamline.cli.options import (
     with_request,
 )
 from beamline.cli.recipe import names_given, repeating
-from beamline.cli.scan_options import light_asked, light_options
-from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.files import REPORT

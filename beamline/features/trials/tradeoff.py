@@ -31,8 +31,7 @@ from beamline.features.trials.plans import (
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.projections.held_out import hold_out, with_views_held_out
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out, with_views_held_out
 from beamline.projections.scan_statistics import Light
 from beamline.reconstruct.outcome import facts_of
 from beamline.reconstruct.plan import times_of

@@ -29,8 +29,7 @@ from beamline.cli.options import (
     with_request,
 )
 from beamline.cli.recipe import names_given, repeating
-from beamline.cli.scan_options import light_asked, light_options
-from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
 from drivers.base.clock import SystemClock
@@ -139,8 +138,7 @@ def tradeoff(request: TradeoffRequest) -> None:
     """
     begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.core.sinks import Warnings
-    from beamline.energies.scans import EnergyScans
-    from beamline.energies.spectra import read_spectra
+    from beamline.energies.scans import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
     from beamline.features.trials.layout import text
     from beamline.features.trials.runner import ComparedScan

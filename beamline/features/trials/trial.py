@@ -37,7 +37,7 @@ class Trial:
     method: str
     views: int
     binning: int = 1
-    settings: Mapping[str, Plain | None] = field(default_factory=dict, hash=False)
+    settings: Mapping[str, Plain | bool | None] = field(default_factory=dict, hash=False)
     halves: bool = False
     parts: int = 1
     seconds_asked: float | None = None

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import I64
 from recon.base.views import parse_views
 
 COUNTS = 360, 180, 90, 45
@@ -27,30 +26,30 @@ class ViewChoice:
 
     Attributes:
         label: in tables.
-        groups: int64 [view, window]: each view is the mean of these views of the scan; None: left out.
+        groups: [view][window]: each view is the mean of these views of the scan; None: left out.
         family: choices of the same family are draws of the same kind; empty: it stands alone.
         reason: why it is left out.
     """
 
     label: str
-    groups: I64 | None
+    groups: Sequence[Sequence[int]] | None
     family: str = ""
     reason: str = ""
 
     @property
     def window(self) -> int:
         """How many views of the scan are averaged into one."""
-        return 0 if self.groups is None else self.groups.shape[1]
+        return len(self.groups[0]) if self.groups else 0
 
     @property
     def frames(self) -> int:
         """Frames of the scan that it takes, each counted once: its dose."""
-        return 0 if self.groups is None else np.unique(self.groups).size
+        return len({view for group in self.groups or () for view in group})
 
     @property
     def n_views(self) -> int:
         """Views that it makes; 0 where it is left out."""
-        return 0 if self.groups is None else self.groups.shape[0]
+        return len(self.groups) if self.groups else 0
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, fami
         numbers = parse_views(spec, angles, period=views.period)
     except ValueError as error:
         return ViewChoice(label, None, family, str(error))
-    return ViewChoice(label, numbers[:, None], family)
+    return ViewChoice(label, numbers[:, None].tolist(), family)
 
 
 def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
@@ -172,10 +171,10 @@ def _windows(views: ViewSet, width: float, count: int | None) -> ViewChoice:
     together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
     if together.sum() < 2:
         return ViewChoice(label, None, reason="the scan's views are too unevenly spread to have neighbours")
-    groups = groups[together].astype(np.int64)
+    groups = groups[together]
     apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
     if apart > _APART:
         return ViewChoice(
             label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
         )
-    return ViewChoice(label, groups)
+    return ViewChoice(label, groups.tolist())

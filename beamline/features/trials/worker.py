@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import pickle
 import sys
 import time
 import warnings
@@ -30,6 +29,7 @@ from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
 from beamline.features.trials.data import TrialData, VolumeAt, averaged, by_parts, write_array
+from beamline.features.trials.launch import JOB
 from beamline.features.trials.trial import Trial
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import squares_left
@@ -253,7 +253,7 @@ def main(job: Path) -> int:
     def say(line: Mapping[str, Any]) -> None:
         print(json.dumps(line), flush=True)  # noqa: T201 - stdout is this process's only way out
 
-    work = pickle.loads(job.read_bytes())  # noqa: S301 - written by the process that started this one
+    work = JOB.validate_json(job.read_bytes())
     try:
         data = TrialData.load(work.data)
         for trial in work.compiled:

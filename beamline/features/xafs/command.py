@@ -22,7 +22,7 @@ from beamline.cli.options import (
     refuse_shared,
     volume_path,
 )
-from beamline.cli.scan_options import underscored
+from beamline.cli.selection_options import underscored
 from beamline.cli.terminal import Terminal, counting, events_shown
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Sink
@@ -219,7 +219,7 @@ def _charge_map(
 ) -> None:
     """`--volume`: the state-of-charge map, and its picture."""
     from beamline.core.files import refuse_existing, remove, write_whole
-    from beamline.energies.spectra import read_spectra
+    from beamline.energies.scans import read_spectra
     from beamline.features.xafs.charge_map import charge_map, picture
     from beamline.storage.volumes.files import write_volume
 

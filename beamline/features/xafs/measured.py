@@ -17,8 +17,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.core.flag import PixelBox
 from beamline.features.xafs.contrast import ContrastRegions, XafsCurve
-from beamline.features.xafs.radiographs import EVERYTHING, FramePart, Radiographs, line_integrals
-from beamline.features.xafs.series import Series
+from beamline.features.xafs.series import EVERYTHING, FramePart, Radiographs, Series, line_integrals
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import ScanSource

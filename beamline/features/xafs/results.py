@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from beamline.core.files import refuse_existing, write_whole
 from beamline.features.xafs.contrast import XafsCurve
 from beamline.features.xafs.edge import AbsorptionEdge
 from beamline.report.figures import WIDTH, new_figure, png
+from recon.prep.matter import HEAVIEST, TabulatedEdge, edges_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +40,6 @@ class XafsResult:
     @property
     def tabulated(self) -> str:
         """Which edge of the tables it is, or where the material has its own; empty: nothing is known of it."""
-        from beamline.features.xafs.tabulated import edge_sentence  # lazily: it imports xraylib, which takes a while
 
         low, high = (float(end) for end in self.curve.energies[[0, -1]])
         return edge_sentence(self.material, self.elements, low, high, self.edge.energy)
@@ -177,3 +178,47 @@ def write_both(drawn: bytes, text: str, target: Path) -> None:
             write_whole(path, content)
             undo.callback(path.unlink)
         undo.pop_all()
+
+
+def _beside(edge: TabulatedEdge, energy: float) -> str:
+    """The edge, and how far it is from an energy in keV."""
+    apart = 1e3 * (edge.energy - energy)
+    return f"{edge.named}, {abs(apart):.4g} eV {'above' if apart > 0 else 'below'}"
+
+
+def nearest_edges(energy: float, elements: Sequence[int] = ()) -> list[TabulatedEdge]:
+    """The nearest edge of these elements; of no elements, the nearest K edge and the nearest L3 edge of all."""
+
+    def nearest(edges: Sequence[TabulatedEdge]) -> list[TabulatedEdge]:
+        return sorted(edges, key=lambda edge: abs(edge.energy - energy))[:1]
+
+    if elements:
+        return nearest(edges_of(elements))
+    edges = edges_of(range(1, HEAVIEST + 1))
+    return [edge for shell in ("K", "L3") for edge in nearest([each for each in edges if each.shell == shell])]
+
+
+def edge_sentence(material: str, elements: Sequence[int], low: float, high: float, edge: float | None) -> str:
+    """Which tabulated edge an edge that was found belongs to; or, without one, where the material has its own.
+
+    Args:
+        material: its name; empty where it is not known. elements: of the material; none: all.
+        low, high: range of energies, keV. edge: keV; None: none was found.
+    """
+    if edge is not None:
+        return f"{'; '.join(_beside(each, edge) for each in nearest_edges(edge, elements))}"
+    if not elements:
+        return ""
+    if own := _within(edges_of(elements), low, high):
+        return f"{material} has {', '.join(each.named for each in own)} in this range"
+    nearest = nearest_edges((low + high) / 2, elements)
+    if not nearest:
+        return f"{material} has no edge at all"
+    where = _beside(nearest[0], low if nearest[0].energy < low else high)
+    sentence = f"{material} has no edge from {low:.4f} to {high:.4f} keV: its nearest is {where} the range"
+    others = [each.named for each in _within(edges_of(range(1, HEAVIEST + 1)), low, high) if each.shell == "K"]
+    return f"{sentence}. In the range lies {', '.join(others)}, of an element that it lacks" if others else sentence
+
+
+def _within(edges: Sequence[TabulatedEdge], low: float, high: float) -> list[TabulatedEdge]:
+    return [each for each in edges if low <= each.energy <= high]

@@ -3,94 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, get_args
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
-from beamline.projections.corrections.counts import Defects
-from beamline.projections.corrections.flags import Flags
-from beamline.projections.step import StepMemory, option
+from beamline.projections.corrections.preparation import Preparation
 from drivers.base.frame import FrameKind
-from recon.base.choices import FlatFields
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.core.sinks import Warn
-    from beamline.projections.protocols import ScanPart
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.references import ReferenceGroups
     from recon.prep.correct import References
 
 _STEADY = 0.01  # of the ring current: top-up keeps it so
-
-
-@dataclass(frozen=True)
-class ReferenceCheck:
-    """How darks and flats are checked. `checked_views` and `OpenBeam` ask for it.
-
-    Attributes:
-        mode: "accept": they are used as they are, also saturated, dark, uneven or lit ones.
-    """
-
-    name: ClassVar[str] = "references"
-    follows: ClassVar[tuple[str, ...]] = ("flags",)
-    needs_finished: ClassVar[str] = ""
-    mode: str = option(
-        "--references",
-        "check",
-        "check: leave out groups of darks and flats with a fault (saturated, dark, uneven or lit); refuse the scan if "
-        "no group remains. accept: use all as they are.",
-        choices=("check", "accept"),
-    )
-
-    @property
-    def accepted(self) -> bool:
-        """All groups are used, whatever their faults."""
-        return self.mode == "accept"
-
-    def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory()
-
-
-@dataclass(frozen=True)
-class Flats:
-    """The open beam of each view. It must be known before counts become line integrals: `OpenBeam` asks for it.
-
-    Attributes:
-        fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components of
-            their changes that the view shows, see `recon.prep.dynamic_flats`.
-        ring_current: "use": views and flats are divided by the ring current that the file has for each frame.
-    """
-
-    name: ClassVar[str] = "flats"
-    follows: ClassVar[tuple[str, ...]] = ("references",)
-    needs_finished: ClassVar[str] = ""
-    fields: FlatFields = option(
-        "--flat-fields",
-        "groups",
-        "groups: interpolate the flat of each view between the means of the groups of flats. dynamic: for a beam that "
-        "moves, also add those variations of the flats that the view shows (needs 4 flats or more).",
-        choices=get_args(FlatFields),
-    )
-    ring_current: str = option(
-        "--ring-current",
-        "ignore",
-        "use: divide views and flats by the ring current of each frame in the file (control/data of NXtomo).",
-        choices=("ignore", "use"),
-    )
-
-    def memory(self, part: ScanPart) -> StepMemory:
-        if self.fields != "dynamic":
-            return StepMemory()
-        from recon.prep.dynamic_flats import search_memory, view_memory
-
-        pixels, flats = part.view_bytes() // 4, int((part.source.image_key == FrameKind.FLAT).sum())
-        return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))
 
 
 def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> References:
@@ -107,10 +39,10 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
     from beamline.storage.rules.exposures import usual_exposure
     from recon.prep.correct import References
 
-    binning, use_damaged = selection.binning, not selection.step(Flags).used
+    binning, use_damaged = selection.binning, not selection.step(Preparation).uses_flags
     darks = _darks(source, np.concatenate(groups.darks), rows, binning, use_damaged)
     dark = _dark_of(usual_exposure(source), darks)
-    scale = light_scale(source, use_current(selection))
+    scale = light_scale(source, selection.step(Preparation).by_current)
     flats = []
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
@@ -161,10 +93,10 @@ def with_dynamic_flats(
     from recon.prep.defects import dead_pixels
     from recon.prep.dynamic_flats import find_dynamic_flats
 
-    frames = np.concatenate(groups.flats)
-    frames = np.setdiff1d(frames, spoilt_frames(source, not selection.step(Flags).used))
-    scale = light_scale(source, use_current(selection))
-    darks = _darks(source, np.concatenate(groups.darks), rows, selection.binning, not selection.step(Flags).used)
+    asked = selection.step(Preparation)
+    frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))
+    scale = light_scale(source, asked.by_current)
+    darks = _darks(source, np.concatenate(groups.darks), rows, selection.binning, not asked.uses_flags)
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame in frames:
@@ -172,7 +104,7 @@ def with_dynamic_flats(
             dark = references.dark if len(darks) < 2 else _dark_of(float(source.exposures[frame]), darks)
             yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
-    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.step(Defects).hot_threshold)
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
     try:
         dynamic = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
     except ValueError as error:
@@ -183,7 +115,9 @@ def with_dynamic_flats(
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections' median; 1 where one is
     unknown. With `by_current` also from its own ring current."""
-    scale = _to_median(source.exposures, source.image_key)
+    from beamline.storage.rules.references import exposures_of
+
+    scale = _to_median(exposures_of(source), source.image_key)
     return scale * current_scale(source) if by_current else scale
 
 
@@ -203,11 +137,6 @@ def view_scale(source: ScanSource, by_current: bool) -> NDArray[np.float64] | No
     return light_scale(source, by_current) if by_current or views_differ(source) else None
 
 
-def use_current(selection: Selection) -> bool:
-    """Views and flats are divided by the ring current."""
-    return selection.step(Flats).ring_current == "use"
-
-
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own ring current to the median of the projections'.
 
@@ -225,7 +154,7 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     """A warning where the ring current changed between flats and views and nobody asked to correct it; "" if not."""
     used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
-    if source.quantity != "counts" or use_current(selection) or (known := source.currents) is None:
+    if source.quantity != "counts" or selection.step(Preparation).by_current or (known := source.currents) is None:
         return ""
     currents = known[used]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():

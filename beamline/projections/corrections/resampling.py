@@ -11,7 +11,7 @@ import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
-from beamline.projections.corrections.counts import CountModel
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
 from beamline.projections.selection import cone_of
 from beamline.projections.step import StepDone, StepMemory, option
@@ -68,7 +68,7 @@ class TiltAndLens:
     """
 
     name: ClassVar[str] = "tilt"
-    follows: ClassVar[tuple[str, ...]] = ("noise",)
+    follows: ClassVar[tuple[str, ...]] = ("preparation",)
     tilt: float | str | None = option(
         "--tilt",
         None,
@@ -237,7 +237,8 @@ def _refined(
 def _without_blur(selection: Selection) -> Selection:
     """The selection without the corrections that blur the views."""
     sharp = tuple(step for step in selection.steps if not isinstance(step, BlurringStep))
-    return replace(selection, steps=sharp).with_steps(CountModel("log"))
+    logarithms = replace(selection.step(Preparation), noise="log", gain=None)
+    return replace(selection, steps=sharp).with_steps(logarithms)
 
 
 def _from(offset: int, total: int, progress: BandsDone) -> BandsDone:

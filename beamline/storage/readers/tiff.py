@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.hdf5 import ALTERED
-from beamline.storage.header import PACKED
+from beamline.storage.structure import PACKED
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan

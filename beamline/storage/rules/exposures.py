@@ -97,37 +97,3 @@ def one_energy(source: ScanSource) -> Iterator[Finding]:
             f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume is of one. Choose it, such "
             f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
         )
-
-
-def exposures_agree(source: ScanSource) -> Iterator[Finding]:
-    """Darks are exposed as long as the projections, or darks of two exposures tell those of any other."""
-    if source.quantity != "counts":
-        return
-    usual = usual_exposure(source)
-    darks, flats = (source.exposures[source.image_key == kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
-    if views_differ(source):
-        views = source.exposures[source.image_key == FrameKind.PROJECTION]
-        known = bool((flats > 0).all())
-        doubt = (
-            f"taken for {usual:g} s."
-            if known
-            else (
-                f"taken for {usual:g} s, and so are the flats, whose exposure is not stated: where the sample fills "
-                "the field, all line integrals may be off by the same amount."
-            )
-        )
-        yield Finding(
-            "info" if known else "warning",
-            "exposures",
-            f"The projections were exposed for {views.min():g} to {views.max():g} s; the light of each is {doubt}",
-        )
-    darks = darks[darks > 0]
-    if np.isnan(usual) or not darks.size:
-        return
-    if np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():
-        yield Finding(
-            "warning",
-            "exposures",
-            f"The darks were exposed for {darks[0]:g} s and the projections for {usual:g} s: hot pixels and dark "
-            "current are not the same. Take darks with the projections' exposure.",
-        )

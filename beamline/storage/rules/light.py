@@ -8,10 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.flats_with_sample import lit_places
+from beamline.monitor.flats_with_sample import BLOCK_SIGMAS, lit_places, noise_of
+from beamline.monitor.odd_references import LIT
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.no_data import counts_photons
+from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure, views_differ
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.references import ReferenceGroups, reference_frame, some_of
+from beamline.storage.rules.references import ReferenceGroups, exposures_of, reference_frame, some_of
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 
@@ -24,10 +27,14 @@ REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see
 BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
 NEAR = 0.02  # share by which a factor may be off a whole number that explains it
 LEAST_SHIFT = 4  # 14 bits in 16; half of all frames are even by chance where they hold few counts
-NOISIER = 3.0  # times: photons by the noise of few frames are known to a factor of 1.5
+NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of views
 BRIGHT = 90.0  # percentile of a view's transmission where it is air, or nearest to it
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
+BELOW, OF_VIEWS = (
+    0.005,
+    0.25,
+)  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 """Limits, each with its reason."""
 
@@ -94,6 +101,46 @@ def light_beside_flats(
             f"images of a camera, and no air tells which is right: references that were multiplied (by about "
             f"{ratio:.2g}), or views that are means of several frames? {explained(source, groups, ratio)}",
         )
+
+
+def darks_beside_views(source: ScanSource, groups: ReferenceGroups, accepted: bool = False) -> Iterator[Finding]:
+    """Darks are images, and no place of the views has fewer counts: light only adds.
+
+    Args:
+        groups: the references that are used.
+        accepted: a fault is a warning.
+    """
+    of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
+    dark, flat = _mean(source, of_darks), _mean(source, of_flats)
+    if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
+        yield Finding(
+            "warning",
+            "light",
+            "All darks are 0, and the flats vary as those of a camera: right where darks were taken off already. Else "
+            "the camera's offset is in views and flats, and makes line integrals too small: give --darks.",
+        )
+    lit = lit_places(flat - dark)
+    if not lit.any():
+        return
+    light = float(np.percentile((flat - dark)[lit], BRIGHT))
+    limit = max(LIT * light, BLOCK_SIGMAS * noise_of(dark))
+    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    under = [(dark - view)[lit] for row in views.tolist() if (view := reference_frame(source, row).cells) is not None]
+    deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
+    if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
+        sentence = (
+            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the {light:.4g} "
+            "of light in the flats), though light only adds: the darks are too high. Were they taken with light, with "
+            "another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
+        )
+        sentence += "" if accepted else " --references accept uses these."
+        yield Finding("warning" if accepted else "error", "light", sentence)
+
+
+def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
+    """Frames are no image that was written for them all."""
+    first = read_known(source, rows[:1])[0]
+    return bool(np.ptp(first) > 0) and (rows.size < 2 or bool((read_known(source, rows[1:2])[0] != first).any()))
 
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
@@ -173,3 +220,36 @@ def _gain(net: F32, light: F32) -> float:
     tiles = each[: rows * TILE, : cols * TILE].reshape(rows, TILE, cols, TILE).mean(axis=(1, 3))
     known = tiles[np.isfinite(tiles)]
     return float(np.percentile(known, QUIET)) if known.size else math.nan
+
+
+def exposures_agree(source: ScanSource) -> Iterator[Finding]:
+    """Darks are exposed as long as the projections, or darks of two exposures tell those of any other."""
+    if source.quantity != "counts":
+        return
+    usual = usual_exposure(source)
+    darks, flats = (source.exposures[source.image_key == kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    if views_differ(source):
+        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        known = bool((flats > 0).all())
+        taken = exposures_of(source)[source.image_key == FrameKind.FLAT]
+        doubt = f"taken for {usual:g} s" + (
+            "."
+            if known
+            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, by which no "
+            "view is brighter than they: where the sample fills the field, all line integrals may be off by one amount."
+        )
+        yield Finding(
+            "info" if known else "warning",
+            "exposures",
+            f"The projections were exposed for {views.min():g} to {views.max():g} s; the light of each is {doubt}",
+        )
+    darks = darks[darks > 0]
+    if np.isnan(usual) or not darks.size:
+        return
+    if np.ptp(darks) <= EXPOSURE_TOLERANCE * usual < np.abs(darks - usual).max():
+        yield Finding(
+            "warning",
+            "exposures",
+            f"The darks were exposed for {darks[0]:g} s and the projections for {usual:g} s: hot pixels and dark "
+            "current are not the same. Take darks with the projections' exposure.",
+        )

@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import block_means, check_block, is_valid
-from beamline.monitor.flats_with_sample import brighter_in_places, flats_like_views, mass_missing, nothing_seen
+from beamline.monitor.flats_with_sample import (
+    brighter_in_places,
+    flats_like_views,
+    lit_places,
+    mass_missing,
+    nothing_seen,
+)
 from beamline.monitor.odd_references import without_odd
 from beamline.monitor.references import (
     BY_CHANCE,
+    WORST,
     Group,
     GroupVerdict,
     ReferenceFrame,
@@ -25,12 +32,13 @@ from beamline.monitor.references import (
     judge,
 )
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.exposures import levelled
+from beamline.storage.rules.exposures import levelled, usual_exposure, views_differ
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
+_BRIGHTER = 0.02  # share of the light by which views may be brighter than flats: a beam drifts by so much
 CELLS = 32  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
@@ -233,6 +241,31 @@ def _as_it_is(source: ScanSource, row: int) -> ReferenceFrame:
         seen[row] = look_at(read_known(source, [row])[0], row)
     kind = FrameKind(int(source.image_key[row]))
     return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
+
+
+def exposures_of(source: ScanSource) -> NDArray[np.float64]:
+    """Seconds of each frame, NaN where unknown.
+
+    Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the first
+    for which no place of the views is brighter than the flats.
+    """
+    flats = np.flatnonzero((source.image_key == FrameKind.FLAT) & ~(source.exposures > 0))
+    darks = np.flatnonzero(source.image_key == FrameKind.DARK)
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if not (flats.size and darks.size and views_differ(source)):
+        return source.exposures
+    dark, light = (
+        np.mean([reference_frame(source, row).cells for row in rows.tolist()], axis=0) for rows in (darks, flats)
+    )
+    lit = lit_places(light - dark)
+    seen = [reference_frame(source, row).cells for row in some_of(views, VIEWS).tolist()]
+    shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if cells is not None]
+    most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if lit.any() else 0.0
+    of_views = source.exposures[views]
+    for each in (of_views.max(), np.median(of_views), of_views.min()):
+        if each <= (1 + _BRIGHTER) * most:
+            return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
+    return source.exposures
 
 
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.storage.header import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.structure import dtype_of, require_held, require_npy, shape_of
 from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from beamline.storage import hdf5
 from beamline.storage.writers import layout
+from beamline.storage.writers.exchange_view import add_exchange_view
 
 STATUSES = ("complete", "stopped", "failed")
 RUNNING = "running"  # of a scan that goes on, or whose program died
@@ -56,3 +57,12 @@ def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEn
     if layout.REASON in datasets:
         datasets[layout.REASON][()] = ending.reason.encode()[: layout.REASON_BYTES].decode(errors="ignore").encode()
     datasets[layout.STATUS][()] = ending.status.encode()
+
+
+def complete(file: hdf5.NewFile, ending: ScanEnding) -> None:
+    """State that a file that `layout.create` made holds all frames of its scan, and how that ended; add /exchange."""
+    file[layout.COMMITTED][()] = len(file[layout.DATA])
+    state_ending(file, ending)
+    file[layout.FINISHED][()] = 1
+    layout.state_field_of_view(file)
+    add_exchange_view(file)

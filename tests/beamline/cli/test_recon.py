@@ -174,7 +174,7 @@ def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> N
     assert result.exit_code == 0, result.output
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
     assert "of 5 s; " in lines["chosen"]
-    assert any(line.startswith("next dB   ") for line in result.stdout.splitlines())
+    assert any(line.startswith("longer    ") for line in result.stdout.splitlines())
     parameters = read_reconstruction(folder / "scan_auto.h5").parameters
     assert parameters["budget"] == 5 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
 

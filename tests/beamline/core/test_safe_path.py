@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from beamline.config.load import config_folder, load, resolved_yaml
+from beamline.core.files import CONFIG
 from beamline.core.process import ChildProcess, ProcessEnd, with_our_path
 from beamline.features.batch.batch import COMMAND
 from beamline.features.trials.launch import command as trial
-from beamline.scan.run_folder import CONFIG
 from beamline.scan.watchdog import watched
 
 OURS = ("beamline", "drivers", "recon", "simulators")

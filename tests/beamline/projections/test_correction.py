@@ -12,7 +12,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.references import Flats
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
@@ -131,14 +131,14 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     source = ArraySource(data.astype(np.float32), [2] + [1] * 12 + [0] * 45, np.r_[[np.nan] * 13, SCAN.angles])
     errors = []
     for way in ("groups", "dynamic"):
-        correction = ScanCorrection(source, Selection(steps=(Flats(way),)), pytest.fail)  # type: ignore[arg-type]
+        correction = ScanCorrection(source, Selection(steps=(Preparation(flat_fields=way),)), pytest.fail)  # type: ignore[arg-type]
         assert bool(correction.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
     assert "components of their changes" in correction.done["flats"].sentence
     few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
     with pytest.raises(ConfigError, match="--flat-fields"):
-        ScanCorrection(few, Selection(steps=(Flats("dynamic"),)), lambda _: None)  # type: ignore[arg-type]
+        ScanCorrection(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)  # type: ignore[arg-type]
 
 
 def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
@@ -152,17 +152,17 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
     none = Selection(steps=(Air("none"),))
     with pytest.raises(ConfigError, match="no ring current"):
-        ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.with_steps(Preparation(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
     source.currents = current
     off = []
-    for selection in (none, none.with_steps(Flats(ring_current="use"))):
+    for selection in (none, none.with_steps(Preparation(ring_current="use"))):
         correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
     assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="views or flats"):
-        ScanCorrection(source, none.with_steps(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.with_steps(Preparation(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
 
 
 BIAS, GLOW = 100.0, 20_000.0  # counts, and counts a second of dark current

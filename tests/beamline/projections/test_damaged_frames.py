@@ -11,7 +11,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep
@@ -60,7 +60,7 @@ def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, i
 
 
 def test_flags_ignore_uses_them_and_says_so(tmp_path: Path) -> None:
-    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), Flags("ignore"))
+    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), Preparation("ignore"))
     assert prepared.projections.view_ids.size == 45
     assert "Frames 9 do not have the pixels that were written" in said and "used as they are" in said
 
@@ -79,7 +79,7 @@ def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple
     path = scan(tmp_path, *rows, bit=0)
     with pytest.raises(DataError, match=f"all {kind} are damaged"):
         prepare(path)
-    assert prepare(path, Flags("ignore"))[0].projections.view_ids.size == 45
+    assert prepare(path, Preparation("ignore"))[0].projections.view_ids.size == 45
 
 
 def test_rows_count_on_behind_references_that_were_given(tmp_path: Path) -> None:

@@ -65,8 +65,13 @@ def test_a_mass_that_changes_is_told_with_its_way(factor_of: object, words: str)
     assert words in sentence
 
 
-@pytest.mark.parametrize("by_deg", [20.0, 40.0])
-def test_views_that_are_late_are_told_with_their_frames(by_deg: float) -> None:
-    late = lambda angles: angles + np.radians(by_deg) * (angles > angles[-1] / 2)  # noqa: E731
+@pytest.mark.parametrize(("by_deg", "ramp"), [(20.0, False), (40.0, False), (6.0, True), (-6.0, True)])
+def test_views_that_are_late_are_told_with_their_frames(by_deg: float, ramp: bool) -> None:
+    """From the middle on, or by a speed that grows or falls along the scan."""
+
+    def late(angles: np.ndarray) -> np.ndarray:
+        done = angles / angles[-1]
+        return angles + np.radians(by_deg) * (4 * done * (1 - done) if ramp else done > 0.5)
+
     (sentence,) = (each for each in told(random_scan(1, angles_of=late)) if each.startswith("Beside their angles"))
     assert sentence.startswith("Beside their angles the views seem to be turned by up to ")

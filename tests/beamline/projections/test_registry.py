@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import CountModel
-from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.phase.phase import Phase
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.registry import all_steps, in_order, recorded, registered, steps_of
 from beamline.projections.selection import Selection
@@ -38,12 +37,15 @@ def test_a_selection_takes_one_step_of_a_kind() -> None:
 
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:
-    steps = [Flags("ignore"), CountModel("counts", 2.0), Rings("vo")]
+    steps = [Preparation("ignore", noise="counts", gain=2.0), Rings("vo")]
     done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
     expected = {
         "flags": "ignore",
+        "references": "check",
         "noise": "counts",
         "gain": 2.0,
+        "flat_fields": "groups",
+        "ring_current": "ignore",
         "noise_said": "counted",
         "rings_removed": "none seen",
     }

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import reference_groups
 from drivers.base.frame import FrameKind
@@ -155,7 +155,7 @@ def test_half_the_current_at_one_group_of_flats_does_no_harm() -> None:
 def test_accepted_references_are_used_as_they_were_taken() -> None:
     blocks = Blocks(1, 3)
     blocks.of(DARK)[0][0] += BEAM
-    selection = Selection(axis_col=AXIS, steps=(ReferenceCheck("accept"),))
+    selection = Selection(axis_col=AXIS, steps=(Preparation(references="accept"),))
     correction = ScanCorrection(blocks.source(), selection, pytest.fail)  # type: ignore[arg-type]
     assert correction._beam is not None
     np.testing.assert_allclose(correction._beam.references.dark.mean(), 100 + BEAM / 3, rtol=0.01)

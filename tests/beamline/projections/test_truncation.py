@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.references import Flats
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.truncation import cut_sides
@@ -49,7 +49,7 @@ def test_a_ring_current_that_nothing_corrects_is_told(ring_current: str, told_of
     current = np.linspace(200, 150, VIEWS)
     source, told = scan(90.0, current[:, None, None] / 200), list[str]()
     source.currents = np.r_[np.full(10, 200.0), current]
-    selection = SELECTION.with_steps(Flats(ring_current=ring_current))
+    selection = SELECTION.with_steps(Preparation(ring_current=ring_current))
     prepare_projections(source, selection, told.append)  # type: ignore[arg-type]
     assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == [
         True

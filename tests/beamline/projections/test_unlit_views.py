@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.selection import Selection
 from drivers.base.frame import FrameKind
@@ -56,7 +56,7 @@ def test_few_of_them_cost_little(unlit: list[int]) -> None:
 
 def test_a_gap_is_told_and_flags_that_are_ignored_change_nothing() -> None:
     told: list[str] = []
-    selection = SELECTION.with_steps(Flags("ignore"))
+    selection = SELECTION.with_steps(Preparation("ignore"))
     prepare_projections(scan(list(range(10, 18)), None), selection, told.append)  # type: ignore[arg-type]
     (line,) = (line for line in told if "no light" in line)
     assert "8 views of 45 (frames 16-23) have no light" in line and "leave 36° without a view" in line

@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import read_known
@@ -87,7 +87,7 @@ def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     scan: SourceOptions = write(tmp_path, spoilt)  # type: ignore[operator]
     told: list[str] = []
     with scan.open() as source:
-        prepared = prepare_projections(source, SELECTION.with_steps(Flags(flags)), told.append)
+        prepared = prepare_projections(source, SELECTION.with_steps(Preparation(flags)), told.append)
     views = np.setdiff1d(np.arange(6, len(FRAMES)), spoilt)
     assert prepared.projections.view_ids.tolist() == views.tolist()
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)

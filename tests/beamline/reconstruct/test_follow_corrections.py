@@ -13,7 +13,7 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
@@ -51,7 +51,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
     clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
-    selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
     reconstruct_file(options(tmp_path, selection=selection), events.append, clock)
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
@@ -67,7 +67,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     frames.append(replace(frames[12], index=34, replaces=12, time=frames[33].time + 1))
     frames[12] = replace(frames[12], counts=frames[12].counts // 40)
     schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
-    selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Preparation("use" if use_flags else "ignore"),))
     metrics = reconstruct_file(options(tmp_path, selection=selection), events.append, clock).metrics
     record = read_reconstruction(tmp_path / "recon.h5")
     assert set(record.parameters["view_frames"]) == set(range(4, 35)) - {12}  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection
-from beamline.reconstruct.sample_box import box_around_sample
+from beamline.reconstruct.region import box_around_sample
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 

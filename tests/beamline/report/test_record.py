@@ -73,21 +73,24 @@ def test_each_look_at_views_held_out_counts_once() -> None:
 def test_a_fit_says_what_longer_fits_gained() -> None:
     made = _made(_record(3.0), "r2")
     assert price_of_decibel(made) == next_decibel_of_fit(30.0, 60)
-    assert "as longer fits gained on four other scans" in price_text(made)
+    assert "as longer fits did on four other scans" in price_text(made)
     late = tuple(replace(p, step=10**6 + p.step) for p in _record(3.0))
     followed = replace(
         _made(_record(3.0), "r2"), settings={"pace": WHILE_VIEWS_COME.pace, "decay": WHILE_VIEWS_COME.decay}
     )
     assert price_of_decibel(followed) is None and price_text(followed) == ""
-    assert price_text(_made(late, "r2")) == "none in reach of what was measured"
+    assert (
+        price_text(_made(late, "r2"))
+        == "A longer reconstruction would hardly bring the volume 1 dB nearer to the sample"
+    )
 
 
 def test_iterations_say_what_another_decibel_would_cost() -> None:
     made = _made(_record(3.0))
     price = price_of_decibel(made)
     assert price is not None and price.seconds == pytest.approx(30 * math.expm1(1 / 3), rel=0.02)
-    assert price_text(made).startswith("about 11.9 s more (")
-    assert "none measurable" in price_text(_made(_record(0.0)))
+    assert price_text(made).startswith("About 11.9 s more would lower the misfit to the views by 1 dB (")
+    assert "would hardly lower the misfit" in price_text(_made(_record(0.0)))
     assert price_of_decibel(_made(())) is None and price_text(_made(())) == ""
 
 

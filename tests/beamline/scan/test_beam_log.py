@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.scan import beam_log
-from beamline.scan.beam_log import BeamLog
+from beamline.scan import supervision as beam_log
 from beamline.scan.run import run_scan
+from beamline.scan.supervision import BeamLog
 from beamline.storage.writers.layout import BEAM
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import BeamReading

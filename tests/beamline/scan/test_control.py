@@ -14,11 +14,10 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
-from beamline.core.files import create_part
+from beamline.core.files import create_part, create_run_folder
 from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
 from beamline.scan import control
 from beamline.scan.control import Verb, running, state_of, tell, verbs_taken
-from beamline.scan.run_folder import create_run_folder
 from beamline.scan.states import State
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument

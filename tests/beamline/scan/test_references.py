@@ -15,7 +15,7 @@ from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.scan.references import ReferenceLog
@@ -217,7 +217,7 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
     result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
     assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
     with open_scan(result.path) as source:
-        selection = Selection(axis_col=19.5, steps=(Air("none"), Flags("ignore")))
+        selection = Selection(axis_col=19.5, steps=(Air("none"), Preparation("ignore")))
         said: list[str] = []
         prepared = prepare_projections(source, selection, said.append)
         assert len(said) == 1 and said[0].startswith("--flags ignore")

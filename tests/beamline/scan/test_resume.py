@@ -22,8 +22,7 @@ from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.refusals import checked_views
 from beamline.projections.selection import Selection
@@ -179,7 +178,7 @@ def _assert_told_of_parts(run: Path) -> None:
         assert describe(part)["findings"].count(line) == 1
         warned: list[str] = []
         with open_scan(part) as source:
-            checked_views(source, Selection(steps=(ReferenceCheck("accept"),)), warned.append)
+            checked_views(source, Selection(steps=(Preparation(references="accept"),)), warned.append)
         assert warned.count(line) == 1
     facts = describe(run / "joined.h5")
     assert not any("parts of a scan" in finding for finding in facts["findings"])
@@ -201,7 +200,7 @@ def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypat
             assert OverlaidSource(source, darks=images).part_starts.tolist() == [0, frames + 2]
             assert OverlaidSource(source, flats=images).part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
-        selection = Selection(axis_col=5.5, steps=(Air("none"), Flags("ignore")))
+        selection = Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore")))
         prepared = prepare_projections(source, selection, lambda said: None)
     assert len(prepared.projections.data) == VIEWS
 
@@ -240,7 +239,7 @@ def test_references_of_the_end_alone_are_taken(
     with open_scan(run / "joined.h5") as source:
         prepared = prepare_projections(
             source,
-            Selection(axis_col=5.5, steps=(Air("none"), Flags("ignore"), ReferenceCheck("accept"))),
+            Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore", "accept"))),
             lambda said: None,
         )
     assert len(prepared.projections.data) == VIEWS

@@ -15,8 +15,8 @@ from beamline.config.load import load
 from beamline.core.stop import ScanStopped, StopRequest
 from beamline.features.files.describe import describe
 from beamline.features.files.validate import validate
-from beamline.projections.corrections.flags import usable_views
 from beamline.projections.replay import judged_flags
+from beamline.projections.usable_views import usable_views
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from beamline.scan.run_folder import create_run_folder, new_log
+from beamline.core.files import create_run_folder, new_log
 
 
 @pytest.mark.parametrize("taken", [0, 1, 3])

@@ -16,9 +16,9 @@ import psutil
 import pytest
 
 from beamline.config.load import Config, config_folder, load, resolved_yaml
+from beamline.core.files import CONFIG, WATCHDOG_LOG
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan import watchdog
-from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from beamline.scan.watchdog import BETWEEN, FROZEN, inhibited, until_dead, watched
 from drivers.base.clock import Clock, SystemClock
 from drivers.epics.channel import PvValue

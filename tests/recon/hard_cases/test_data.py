@@ -262,15 +262,15 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     run_steps(state, problem, SHORT, 100)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     assert fit.misfit_of(state, problem, SHORT) < 0.8 * before
-    seen = fit.volume_of(state, flat, SHORT).data
-    cubes = fit.volume_of(state, Grid((9, 48, 48)), SHORT).data
+    seen = fit.volume_of(state, flat, VIEWS, SHORT).data
+    cubes = fit.volume_of(state, Grid((9, 48, 48)), VIEWS, SHORT).data
     np.testing.assert_allclose(seen[1], cubes[4], atol=1e-4 * float(cubes.max()))
     # What the loss counts is the variation of these flat voxels, here of all of them: the box is as large as the grid.
     whole = replace(SHORT, tv_size=48, truncation=Truncation(9.0, 1e-12), views_per_step=1)
     losses = []
     for weight in (0.0, 20.0):
         state = fit.init(a_few(), 0)
-        volume = fit.volume_of(state, flat, whole).data / state.unit
+        volume = fit.volume_of(state, flat, VIEWS, whole).data / state.unit
         losses.append(fit.step(state, problem, replace(whole, tv_weight=weight), 0.0, view=3).loss)
     steps = np.concatenate([np.abs(np.diff(volume, axis=axis)).ravel() for axis in range(3)])
     assert losses[1] - losses[0] == pytest.approx(20.0 * steps.mean(), rel=1e-3)
@@ -278,7 +278,7 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     varied = []
     for weight in (0.0, 20.0):
         state = run_steps(fit.init(a_few(), 0), problem, replace(SHORT, tv_size=48, tv_weight=weight), 60)
-        varied.append(np.abs(np.diff(fit.volume_of(state, flat, SHORT).data, axis=2)).mean())
+        varied.append(np.abs(np.diff(fit.volume_of(state, flat, VIEWS, SHORT).data, axis=2)).mean())
     assert varied[1] < 0.7 * varied[0]
 
 

@@ -49,7 +49,7 @@ def test_a_disturbed_model_finds_back_to_the_data(random_gaussians: Make, rng: n
     expected = voxelize(truth, GRID).numpy()
     before = np.sqrt(((voxelize(start, GRID).numpy() - expected) ** 2).mean())
     run_steps(state, problem, PLAIN, 600)
-    after = np.sqrt(((fit.volume_of(state, GRID, PLAIN).data - expected) ** 2).mean())
+    after = np.sqrt(((fit.volume_of(state, GRID, problem.geometry, PLAIN).data - expected) ** 2).mean())
     assert after < 0.2 * before
     assert state.residual < 0.03
 

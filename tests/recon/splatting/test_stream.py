@@ -219,7 +219,7 @@ def test_the_volume_is_that_of_the_mean_of_the_last_steps(data: np.ndarray, phan
     assert {name: values.shape for name, values in state.mean.items()} == {
         name: values.shape for name, values in state.parameters.items()
     }
-    last = fit.volume_of(state, GRID, settings).data
+    last = fit.volume_of(state, GRID, VIEWS, settings).data
     assert psnr(truth, model.snapshot().data) > psnr(truth, last) + 0.3
 
 

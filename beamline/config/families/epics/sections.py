@@ -6,10 +6,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from beamline.config.monochromator import FoundMonochromator
+from beamline.config.beam import FoundMonochromator, FoundShutter
 from beamline.config.places import FoundFilter, Name, refuse_equal
 from beamline.config.section import declared, read_from, section_of, without
-from beamline.config.shutters import FoundShutter
 from drivers.base.clock import Clock
 from drivers.epics.channel import url_problem
 from drivers.epics.devices import (

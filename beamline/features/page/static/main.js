@@ -1,5 +1,5 @@
 // The page of a run: it follows the feed, and fetches pictures as they are needed.
-import { NAMES, PLANES, Picture, debounce, fetchTile, position, usualWindow, windowSliders } from "./picture.js";
+import { PLANES, Picture, debounce, fetchTile, namesOf, packed, position, usualWindow, windowButtons, windowSliders } from "./picture.js";
 import { Timeline } from "./flags.js";
 
 const $ = (id) => document.getElementById(id);
@@ -100,9 +100,11 @@ async function fetchSinogram() {
     mine.views.push(...tile.views);
     if (mine.views.length) {
       mine.order = byAngle(mine.views);
-      const packed = packLines(mine.order.map((view) => mine.lines[view]), mine.cols);
-      sinogram.window = usualWindow(packed);
-      sinogram.show(packed, [mine.lines.length, mine.cols]);
+      const shape = [mine.lines.length, mine.cols], values = new Float32Array(shape[0] * shape[1]);
+      mine.order.forEach((view, line) => values.set(mine.lines[view], line * mine.cols));
+      const tile = packed(values, shape);
+      sinogram.window = usualWindow(tile);
+      sinogram.show(tile, shape);
     }
     $("sinogram-name").textContent = `of row ${row}, ${mine.views.length} views${mine.order.some((view, line) => view !== line) ? ", by angle" : ""}`;
   } catch (error) { $("sinogram-name").textContent = error.message; }
@@ -119,17 +121,16 @@ function byAngle(frames) {
   return order.sort((a, b) => within[a] - within[b]);
 }
 
-function packLines(lines, cols) {
-  let low = Infinity, high = -Infinity;
-  for (const line of lines) for (const value of line) { low = Math.min(low, value); high = Math.max(high, value); }
-  const scale = (high - low) / 65534 || 1, numbers = new Uint16Array(lines.length * cols);
-  lines.forEach((line, i) => line.forEach((value, k) => { numbers[i * cols + k] = Math.round((value - low) / scale); }));
-  return { numbers, shape: [lines.length, cols], offset: low, scale, bin: 1 };
-}
 $("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
 
 // --- volume ------------------------------------------------------------------------------------------------------
-const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
+let chosenWindow = false;  // by hand: it stays when the next snapshot comes
+const showWindow = (window) => slices.forEach((slice) => slice.setWindow(window));
+const setVolumeWindow = windowSliders($("volume-window"), (window) => { chosenWindow = true; showWindow(window); });
+function setWindowOf(window) {
+  const ends = Object.values(volume.windows).flat(), [low, high] = [Math.min(...ends), Math.max(...ends)];
+  setVolumeWindow([low - (high - low), high + (high - low)], window); showWindow(window);
+}
 const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
   draw: (context, place) => { if (axis === 0 && volume && volume.unseen_deg.length) dial(context, volume.unseen_deg); },
   point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
@@ -147,14 +148,14 @@ function dial(context, [first, last]) {
 function place(axis, row, col) {
   const index = [0, 0, 0];
   index[axis] = Number($(`at${axis}`).value); index[PLANES[axis][0]] = row; index[PLANES[axis][1]] = col;
-  return index.map((value, i) => `${NAMES[i]} ${position(volume, i, value)}`).join(", ");
+  return index.map((value, i) => `${namesOf(volume)[i]} ${position(volume, i, value)}`).join(", ");
 }
 
 
 async function fetchVolume() {
   const answer = await fetch("view/api/volumes");
   if (!answer.ok) return;
-  const first = volume === null, before = volume;
+  const before = volume;
   [volume] = await answer.json();
   $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `views 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}${volume.because ? `; ${volume.because}` : ""}`;
   const changed = !before || before.shape.join() !== volume.shape.join();
@@ -163,7 +164,8 @@ async function fetchVolume() {
     if (changed) $(`at${axis}`).value = Math.floor(volume.shape[axis] / 2);
   }
   $("viewer-link").hidden = false;
-  if (first) { const [low, high] = volume.window; setVolumeWindow([low - (high - low), high + (high - low)], volume.window); slices.forEach((slice) => { slice.window = volume.window; }); }
+  windowButtons($("volume-window"), volume.windows, (window) => { chosenWindow = window !== volume.window; setWindowOf(window); });
+  if (!chosenWindow) setWindowOf(volume.window);
   await Promise.all([0, 1, 2].map(showSlice));
   fetchModel();
 }

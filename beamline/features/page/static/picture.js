@@ -29,11 +29,11 @@ export function usualWindow(tile, low = 0.005, high = 0.995) {
 export class Picture {
   /**
    * `extent`: [rows, cols] of the whole picture. Callbacks: `point(row, col, value)` under the pointer (null: outside),
-   * `region([r0, r1, c0, c1])` or `line([r0, c0, r1, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
-   * `stretch`: rows and columns each fill the canvas. `choosing`: says that a drag chooses without Shift, as on a tablet.
+   * `pick(row, col)` a click, `region([r0, r1, c0, c1])` or `line([r0, c0, r1, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
+   * `stretch`: rows and columns each fill the canvas, as those of a strip always do. `choosing`: says that a drag chooses without Shift, as on a tablet.
    */
-  constructor(canvas, { point = () => {}, region = null, line = null, moved = () => {}, draw = () => {}, stretch = false, choosing = () => false } = {}) {
-    Object.assign(this, { canvas, point, region, line, moved, drawOver: draw, stretch, choosing });
+  constructor(canvas, { point = () => {}, pick = () => {}, region = null, line = null, moved = () => {}, draw = () => {}, stretch = false, choosing = () => false } = {}) {
+    Object.assign(this, { canvas, point, pick, region, line, moved, drawOver: draw, stretch, choosing });
     this.extent = [1, 1]; this.window = [0, 1]; this.zoom = 1; this.centre = [0.5, 0.5];
     this.image = document.createElement("canvas"); this.tile = null; this.dragged = null; this.pending = false;
     new ResizeObserver(() => this.redraw()).observe(canvas);
@@ -71,7 +71,7 @@ export class Picture {
   layout() {
     const box = this.canvas.getBoundingClientRect(), [rows, cols] = this.extent;
     const fit = [box.height / rows, box.width / cols], least = Math.min(...fit);
-    const [down, across] = (this.stretch ? fit : [least, least]).map((scale) => scale * this.zoom);
+    const [down, across] = (this.stretch || Math.max(rows / cols, cols / rows) > 8 ? fit : [least, least]).map((scale) => scale * this.zoom);
     return { down, across, left: box.width / 2 - this.centre[1] * cols * across, top: box.height / 2 - this.centre[0] * rows * down, box };
   }
 
@@ -136,18 +136,19 @@ export class Picture {
 
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
-    this.dragged = { x: event.clientX, y: event.clientY, from: this.place(event), choose: (event.shiftKey || this.choosing()) && (this.region || this.line) };
+    this.dragged = { x: event.clientX, y: event.clientY, moved: 0, from: this.place(event), choose: (event.shiftKey || this.choosing()) && (this.region || this.line) };
   }
 
   drag(event) {
     const [row, col] = this.place(event);
     if (this.dragged && this.dragged.choose) { this.chosen = (this.line ? this.lineTo : this.between).call(this, this.dragged.from, [row, col]); this.redraw(); return; }
-    if (this.dragged) { this.moveBy(event.clientY - this.dragged.y, event.clientX - this.dragged.x); this.dragged.x = event.clientX; this.dragged.y = event.clientY; }
+    if (this.dragged) { this.dragged.moved += Math.hypot(event.movementX, event.movementY); this.moveBy(event.clientY - this.dragged.y, event.clientX - this.dragged.x); this.dragged.x = event.clientX; this.dragged.y = event.clientY; }
     this.tell(row, col);
   }
 
   release() {
     if (this.dragged && this.dragged.choose && this.chosen) (this.line || this.region)(this.chosen);
+    else if (this.dragged && this.dragged.moved < 3) this.pick(...this.dragged.from);
     this.dragged = null;
   }
 
@@ -162,11 +163,17 @@ export class Picture {
     return [clip(from[0], 0), clip(from[1], 1), clip(to[0], 0), clip(to[1], 1)];
   }
 
-  tell(row, col) {
-    if (!this.tile) return;
+  /** The value at a row and a column; undefined where nothing is shown. */
+  at(row, col) {
+    if (!this.tile) return undefined;
     const [r0, , c0] = this.shown, bin = this.tile.bin || 1, i = Math.floor((row - r0) / bin), k = Math.floor((col - c0) / bin);
     const inside = row >= 0 && col >= 0 && row < this.extent[0] && col < this.extent[1] && i >= 0 && k >= 0 && i < this.tile.shape[0] && k < this.tile.shape[1];
-    if (inside) this.point(Math.floor(row), Math.floor(col), valueAt(this.tile, i, k), bin); else this.point(null);
+    return inside ? valueAt(this.tile, i, k) : undefined;
+  }
+
+  tell(row, col) {
+    const value = this.at(row, col);
+    if (value === undefined) this.point(null); else this.point(Math.floor(row), Math.floor(col), value, this.tile.bin || 1);
   }
 
   key(event) {
@@ -202,12 +209,33 @@ export function windowSliders(row, changed) {
   };
 }
 
-/** Axes of a volume, and the axes down and across a slice across each. */
-export const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]];
+/** Values [row, col] as a tile, as the server packs them. */
+export function packed(values, [rows, cols]) {
+  let low = Infinity, high = -Infinity;
+  for (const value of values) { if (value < low) low = value; if (value > high) high = value; }
+  const scale = (high - low) / 65534 || 1;
+  return { numbers: Uint16Array.from(values, (value) => value === value ? Math.round((value - low) / scale) : 65535), shape: [rows, cols], offset: low, scale, bin: 1 };
+}
 
-/** A voxel's place along an axis from the volume's middle, in its unit of length; its number where that is unknown. */
-export function position({ shape, voxel, length_unit: unit }, axis, index) {
-  return unit === "px" ? `${index}` : `${((index - (shape[axis] - 1) / 2) * voxel[axis]).toPrecision(4)} ${unit}`;
+/** Buttons that set named grey windows, in a row: `choose(window)`. */
+export function windowButtons(row, windows, choose) {
+  row.querySelectorAll("button").forEach((button) => button.remove());
+  for (const [name, window] of Object.entries(windows)) {
+    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name, title: "grey window" });
+    button.addEventListener("click", () => choose(window));
+    row.append(button);
+  }
+}
+
+/** The axes down and across a slice across each axis of a volume. */
+export const PLANES = [[1, 2], [0, 2], [0, 1]];
+/** Names of the axes of a volume, or of the stack of a scan's views. */
+export const namesOf = ({ angles }) => angles.length ? ["view", "row", "column"] : ["z", "y", "x"];
+
+/** A voxel's place along an axis from the volume's middle, in its unit of length; its number where that is unknown; of a view its angle, too. */
+export function position({ shape, voxel, length_unit: unit, angles }, axis, index) {
+  if (unit !== "px") return `${((index - (shape[axis] - 1) / 2) * voxel[axis]).toPrecision(4)} ${unit}`;
+  return axis === 0 && angles.length ? `${index} (${angles[index] === null ? "no angle" : `${angles[index].toFixed(2)}°`})` : `${index}`;
 }
 
 export function debounce(call, ms) { let timer = 0; return (...values) => { clearTimeout(timer); timer = setTimeout(() => call(...values), ms); }; }

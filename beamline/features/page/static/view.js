@@ -1,29 +1,32 @@
 // One volume, or two with their difference: slices across z, y, x with one zoom each, grey window, profile, histogram.
-// Of a series in time: a slider for the time, and a player.
-import { NAMES, PLANES, Picture, debounce, fetchTile, position, usualWindow, windowSliders } from "./picture.js";
+// Of a series in time: a slider for the time, and a player. Of a scan: its views as a stack, see scan.js.
+import { PLANES, Picture, debounce, fetchTile, namesOf, position, usualWindow, windowButtons, windowSliders } from "./picture.js";
+import { showScan } from "./scan.js";
 
 const $ = (name) => document.getElementById(name);
 const COLOURS = ["#1f6feb", "#d29922"];
 const json = async (url) => { const answer = await fetch(url), body = await answer.json(); if (!answer.ok) throw new Error(body.message); return body; };
 
-let volumes = [], rows = [], profiled = null, plots = {};
+let volumes = [], rows = [], profiled = null, plots = {}, crossed = true;
 
 /** A row of slices: `url(axis, index)` of its tiles, `shape` and facts of its volume. */
 function addRow(title, facts, url) {
   const heading = document.createElement("h2"), box = document.createElement("div");
   heading.textContent = title; box.className = "slices";
-  const row = { facts, url, window: facts.window, pictures: [] };
+  const row = { title, facts, url, window: facts.window, pictures: [] };
   for (let axis = 0; axis < 3; axis++) {
     const canvas = document.createElement("canvas");
     canvas.id = `slice${rows.length}${axis}`; canvas.tabIndex = 0;
-    canvas.setAttribute("aria-label", `${title}, slice across ${NAMES[axis]}`);
+    canvas.setAttribute("aria-label", `${title}, slice across ${namesOf(facts)[axis]}`);
     box.append(canvas);
     row.pictures.push(new Picture(canvas, {
-      point: (r, c, value) => { $("value").textContent = r === null ? "" : `${title}, ${place(row, axis, r, c)}: ${value.toPrecision(5)} ${facts.unit}`; },
+      point: (r, c) => { $("value").textContent = r === null ? "" : `${place(row, axis, r, c)}: ${valuesAt(row, axis, r, c)} ${facts.unit}`; },
+      pick: (r, c) => PLANES[axis].forEach((side, i) => { $(`at${side}`).value = Math.floor([r, c][i] * volumes[0].shape[side] / facts.shape[side]); showAxis(side); }),
       choosing: () => $("measure").checked,
+      stretch: axis > 0 && facts.angles.length > 0,  // an angle has no length
       line: (line) => { profiled = { axis, line, row }; showProfile(); },
       moved: () => follow(row, axis),
-      draw: (context, { x }) => drawScale(context, canvas, x, row, axis),
+      draw: (context, at) => { drawCross(context, canvas, at, row, axis); drawScale(context, canvas, at.x, row, axis); },
     }));
     canvas.addEventListener("keydown", (event) => {
       const step = { PageUp: 1, PageDown: -1 }[event.key];
@@ -43,15 +46,34 @@ const indexIn = (facts, axis) => Math.min(facts.shape[axis] - 1, Math.floor((Num
 function place({ facts }, axis, row, col) {
   const at = [0, 0, 0];
   at[axis] = indexIn(facts, axis); at[PLANES[axis][0]] = row; at[PLANES[axis][1]] = col;
-  return at.map((index, i) => `${NAMES[i]} ${position(facts, i, index)}`).join(", ");
+  return at.map((index, i) => `${namesOf(facts)[i]} ${position(facts, i, index)}`).join(", ");
 }
 
-/** A bar of a round length in the lower left corner. */
+/** What every row shows at a place of one of them: values are compared, not remembered. */
+function valuesAt(row, axis, r, c) {
+  const values = rows.map((other) => other.pictures[axis].at(...[r, c].map((at, i) => (at + 0.5) * other.facts.shape[PLANES[axis][i]] / row.facts.shape[PLANES[axis][i]])));
+  return values.map((value, i) => value === undefined ? "" : `${rows.length > 1 ? `${rows[i].title} ` : ""}${value.toPrecision(5)}`).filter(Boolean).join(", ");
+}
+
+/** Where the other two slices cut this one, with a gap about the point. */
+function drawCross(context, canvas, { x, y }, { facts }, axis) {
+  if (!crossed) return;
+  const { width, height } = canvas.getBoundingClientRect(), [down, across] = PLANES[axis].map((side) => indexIn(facts, side) + 0.5);
+  const [px, py] = [x(across), y(down)];
+  context.strokeStyle = "#d2992299"; context.lineWidth = 1; context.beginPath();
+  for (const [from, to] of [[0, px - 14], [px + 14, width]]) { context.moveTo(from, py); context.lineTo(to, py); }
+  for (const [from, to] of [[0, py - 14], [py + 14, height]]) { context.moveTo(px, from); context.lineTo(px, to); }
+  context.stroke();
+}
+
+/** Names of the two axes, and a bar of a round length in the lower left corner. */
 function drawScale(context, canvas, x, { facts }, axis) {
+  context.fillStyle = "#fff"; context.strokeStyle = "#000"; context.lineWidth = 3; context.font = "12px system-ui";
+  const [down, across] = PLANES[axis].map((side) => namesOf(facts)[side]), named = `${across} →  ${down} ↓`;
+  context.strokeText(named, 10, 16); context.fillText(named, 10, 16);
   const pixel = facts.voxel[PLANES[axis][1]], perScreen = pixel / (x(1) - x(0)), wanted = 90 * perScreen;
   const ten = 10 ** Math.floor(Math.log10(wanted)), round = [5, 2, 1].find((n) => n * ten <= wanted) * ten, wide = round / perScreen;
   const height = canvas.getBoundingClientRect().height;
-  context.fillStyle = "#fff"; context.strokeStyle = "#000"; context.lineWidth = 3; context.font = "12px system-ui";
   context.strokeRect(10, height - 14, wide, 4); context.fillRect(10, height - 14, wide, 4);
   const text = `${Number(round.toPrecision(1))} ${facts.length_unit}`;
   context.strokeText(text, 10, height - 20); context.fillText(text, 10, height - 20);
@@ -95,6 +117,7 @@ function again(row, axis, ready) {
 
 async function showAxis(axis) {
   $(`where${axis}`).textContent = position(volumes[0], axis, Number($(`at${axis}`).value));
+  rows.forEach((row) => row.pictures.forEach((picture) => picture.redraw()));  // the cross-hair moves
   await Promise.all(rows.map((row) => showSlice(row, axis)));
   if (profiled && profiled.axis === axis) showProfile();
 }
@@ -148,7 +171,7 @@ function draw(name, title, unit, x, lines, scales) {
   plots[name] = new uPlot({
     width: $(name).clientWidth || 600, height: 260, scales, axes: [{ ...axis, label: title }, { ...axis, label: unit, size: 70 }],
     series: [{ label: title }, ...lines.map((line, i) => ({ label: line.name, stroke: COLOURS[i], width: 1.5 }))],
-    hooks: name === "histogram" ? { draw: [drawWindow] } : {},
+    legend: { show: name !== "angles" && name !== "light" }, hooks: name === "histogram" ? { draw: [drawWindow] } : {},
   }, [x, ...lines.map((line) => line.values)], $(name));
 }
 
@@ -162,18 +185,23 @@ function drawWindow(plot) {
   }
 }
 
-/** Width of the strongest body along a profile at half of its height over the profile's ends; null where it reaches an end. */
+/** Width of the one body that a profile crosses at half of its height over the profile's ends; why there is none. */
 function widthOf({ distance, values }) {
-  const base = (values[0] + values.at(-1)) / 2, height = values.map((value) => Math.abs(value - base)), top = height.indexOf(Math.max(...height));
-  const half = height[top] / 2, side = (step) => {
-    let i = top;
-    while (height[i] > half && i + step in height) i += step;
-    if (height[i] > half) return null;
-    const before = i - step, share = (height[before] - half) / (height[before] - height[i]);
-    return distance[before] + share * (distance[i] - distance[before]);
-  };
-  const [from, to] = half > 0 ? [side(-1), side(1)] : [null, null];
-  return from === null || to === null ? null : to - from;
+  const base = (values[0] + values.at(-1)) / 2, spread = values.map((value) => value - base), top = spread.reduce((a, b) => Math.abs(b) > Math.abs(a) ? b : a, 0);
+  const height = spread.map((value) => value / top), edges = [];  // 1 at the top of the body
+  let inside = false, from = 0;
+  height.forEach((value, i) => {  // an edge goes from below a quarter to above three quarters, or back
+    if (inside ? value < 0.25 : value > 0.75) { edges.push([from, i]); inside = !inside; }
+    if (inside ? value > 0.75 : value < 0.25) from = i;
+  });
+  if (!(Math.abs(height[0]) < 0.25) || edges.length !== 2 || inside || Math.min(...height) < -0.5) return null;
+  const [rise, fall] = edges.map(([a, b]) => {
+    let i = a;
+    while (i + 1 < b && (height[i + 1] - 0.5) * (height[a] - 0.5) > 0) i++;
+    return distance[i] + (0.5 - height[i]) / (height[i + 1] - height[i]) * (distance[i + 1] - distance[i]);
+  });
+  const sharp = edges.every(([a, b]) => distance[b - 1] - distance[a] <= 0.6 * (fall - rise));  // else there is a step on the way
+  return sharp ? fall - rise : null;
 }
 
 async function showProfile() {
@@ -184,8 +212,8 @@ async function showProfile() {
   }));
   const distance = found[0].distance;  // of the same line in steps of the first volume's voxels
   const lines = found.map((each, i) => ({ name: volumes[i].name, values: distance.map((d, k) => each.values[Math.round(k * (each.values.length - 1) / Math.max(distance.length - 1, 1))]) }));
-  const unit = volumes[0].length_unit, widths = found.map(widthOf).map((width, i) => width === null ? "" : `; ${volumes.length > 1 ? `${volumes[i].name}: ` : ""}${width.toPrecision(3)} ${unit} wide at half height`);
-  $("profile-name").textContent = `${distance.at(-1).toPrecision(4)} ${unit} in a slice across ${NAMES[axis]}${widths.join("")}`;
+  const unit = volumes[0].length_unit, widths = found.map(widthOf).map((width, i) => width === null ? (i ? "" : "; no width: it does not cross one body") : `; ${volumes.length > 1 ? `${volumes[i].name}: ` : ""}${width.toPrecision(3)} ${unit} wide at half height`);
+  $("profile-name").textContent = `${distance.at(-1).toPrecision(4)} ${unit} in a slice across ${namesOf(volumes[0])[axis]}${widths.join("")}`;
   draw("profile", volumes[0].length_unit, volumes[0].unit, distance, lines, { x: { time: false } });
 }
 
@@ -204,15 +232,11 @@ async function start() {
   volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `api/slice/${which}/${axis}/${index}`));
   const showWindow = (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); };
   const setRange = windowSliders($("window"), showWindow);
-  const ends = Object.values(first.windows), low = Math.min(...ends.map((each) => each[0])), high = Math.max(...ends.map((each) => each[1]));
+  const ends = Object.values(first.windows).flat(), low = Math.min(...ends), high = Math.max(...ends);
   const range = [low - (high - low), high + (high - low)];
   for (const row of rows) row.window = first.window;
   setRange(range, first.window);
-  for (const [name, window] of Object.entries(first.windows)) {
-    const button = Object.assign(document.createElement("button"), { type: "button", textContent: name, title: "grey window" });
-    button.addEventListener("click", () => { setRange(range, window); showWindow(window); });
-    $("window").append(button);
-  }
+  windowButtons($("window"), first.windows, (window) => { setRange(range, window); showWindow(window); });
   const several = volumes.map((each) => each.seconds).filter((each) => each.length);
   if (second && first.shape.join() === second.shape.join() && several.every((each) => each.length === several[0].length)) {
     $("difference-window").hidden = false;
@@ -220,12 +244,19 @@ async function start() {
     setDifference = windowSliders($("difference-window"), (window) => { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); });
   }
   for (let axis = 0; axis < 3; axis++) {
+    $(`name${axis}`).textContent = namesOf(first)[axis];
     Object.assign($(`at${axis}`), { max: first.shape[axis] - 1, value: Math.floor(first.shape[axis] / 2) });
     $(`at${axis}`).addEventListener("input", debounce(() => showAxis(axis), 40));
   }
   startTimes();
   await ($("times").hidden ? Promise.all([0, 1, 2].map(showAxis)) : showTime());
   await showHistogram();
+  if (first.angles.length) await showScan(first, draw);
 }
 
+document.addEventListener("keydown", (event) => {
+  if (event.key !== "x" && event.key !== "X") return;
+  crossed = !crossed;
+  rows.forEach((row) => row.pictures.forEach((picture) => picture.redraw()));
+});
 start().catch((error) => { $("names").textContent = error.message; });

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.core.text import count, frames_text
-from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import Unmoved
 from beamline.projections.selection import cone_of, geometry_of, rows_of
 from beamline.projections.step import StepDone, StepMemory, option
+from beamline.projections.usable_views import part_numbers
 from drivers.base.frame import FrameKind
 from recon.base.volume import Grid
 from recon.features.jumps.clusters import jump_clusters, part_groups, thinned
-from recon.prep.jump_parts import part_numbers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -173,12 +173,13 @@ def find_jumps(
 def _search_memory(source: ScanSource, selection: Selection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
-    from beamline.projections.corrections.flags import usable_views
+    from beamline.projections.usable_views import usable_views
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
 
-    flags, jumps = selection.step(Flags), usable_views(source, selection.step(Flags).used).jumps
-    if cone_of(source, selection) is not None or not (flags.judged or jumps.size):
+    asked = selection.step(Preparation)
+    jumps = usable_views(source, asked.uses_flags).jumps
+    if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
         return 0
     frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     fit = _Fit(source, selection, (source.shape[1] - 1) / 2, frames, jumps)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from beamline.core.errors import ConfigError
-from beamline.projections.corrections.counts import Defects
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.step import StepDone, StepMemory, option, positive
 
@@ -113,7 +113,7 @@ class Phase:
         paganin, sentence = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
-            paganin.retrieve(views.data, selection.step(Defects).floor)
+            paganin.retrieve(views.data, selection.step(Preparation).floor)
             return views
 
         return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})

@@ -15,9 +15,9 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage.header import dtype_of, shape_of
 from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.structure import dtype_of, shape_of
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import SETTINGS, bytes_below, open_below
 from beamline.storage.foreign_zarr import is_halved
-from beamline.storage.header import dtype_of, require_held, shape_of
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
+from beamline.storage.structure import dtype_of, require_held, shape_of
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.volumes.registry import REGISTRY
 

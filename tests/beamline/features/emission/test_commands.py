@@ -21,8 +21,8 @@ from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, spl
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.features.trials.worker import run
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import DiskBuffer, prepare_projections
+from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
@@ -101,7 +101,7 @@ def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(("--bin", "2"), "go with --bin"), (("--rings", "sort"), "go with the correction 'rings'"),
+    [(("--bin", "2"), "go with --bin"), (("--rings", "sort"), "go with --rings"),
      (("--cols", "2:30"), "go with --cols"), (("--follow",), "do not grow")],
 )  # fmt: skip
 def test_what_counts_do_not_take_is_refused(pet: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
@@ -191,7 +191,7 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     with open_scan(pet) as source:
         prepared = prepare_projections(source, Selection(), pytest.fail)
     assert prepared.emission is not None
-    groups = np.arange(24).reshape(12, 2)
+    groups = np.arange(24).reshape(12, 2).tolist()
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
     data = TrialData(prepared, None)

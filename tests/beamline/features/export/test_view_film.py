@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.export.view_film import views_by_angle
+from beamline.features.export.film_file import views_by_angle
 from tests.beamline.array_source import ArraySource
 
 

@@ -18,7 +18,7 @@ from beamline import api
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
-from beamline.energies.spectra import read_spectra
+from beamline.energies.scans import read_spectra
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.job import progress_events

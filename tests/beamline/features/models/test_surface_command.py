@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.gaussians.model import read_model
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.features.surfaces.gaussians import density_at
+from recon.features.surfaces.marching import density_at
 from tests.beamline.cli.small_scan import beamline, left
 
 pytest.importorskip("skimage")

@@ -79,7 +79,7 @@ def browser() -> Iterator[Browser]:
 def canvas_has_picture(browser: Browser, name: str) -> object:
     """The canvas holds more than one grey value."""
     return browser.script(
-        f"const c = document.getElementById('{name}'); if (!c) return false;"
+        f"const c = document.getElementById('{name}'); if (!c || !c.width) return false;"
         "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
         "const greys = new Set(); for (let i = 0; i < d.length; i += 4) greys.add(d[i]); return greys.size > 3;"
     )

@@ -209,3 +209,22 @@ def test_napari_gets_the_volume_and_its_labels(here: Path, monkeypatch: pytest.M
     assert layers["particles"][0].max() == len(WHOLE)
     assert layers["volume"][0].shape == layers["particles"][0].shape
     assert layers["volume"][1] == layers["particles"][1] == (VOXEL,) * 3
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_first_line_says_whether_the_table_is_of_use(here: Path) -> None:
+    """A pin of metal does not stand for the sample, and a square that cuts most bodies gives way to the whole volume."""
+    z, y, x = np.mgrid[:30, :80, :80] - np.array([14.5, 39.5, 39.5])[:, None, None, None]
+    data = np.where(y**2 + x**2 < 30**2, np.float32(0.1), np.float32(0))
+    data[(y**2 + x**2 < 5**2) & (np.abs(z) < 9)] = 4
+    np.save(here / "pin.npy", data)
+    result = beamline("segment", "pin.npy")
+    assert result.stdout.startswith("of use      yes, 1 whole particle of the densest of")
+    data[...] = 0
+    for turn in np.arange(0, 2 * np.pi, np.pi / 4):  # at the sample's edge, where the square ends
+        data[z**2 + (y - 26 * np.sin(turn)) ** 2 + (x - 26 * np.cos(turn)) ** 2 < 8**2] = 1
+    np.save(here / "balls.npy", data)
+    result = beamline("segment", "balls.npy")
+    assert result.stdout.startswith("of use      yes, 8 whole particles") and "cuts most bodies" in result.stdout
+    result = beamline("segment", "balls.npy", "--crop", "square", "-o", "square.h5")
+    assert result.stdout.startswith("of use      no, ") and "--crop none takes the whole volume" in result.stdout

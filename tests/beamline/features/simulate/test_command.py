@@ -18,7 +18,7 @@ from beamline.cli.main import main
 from beamline.core.shipped import shipped_scenes
 from beamline.features.simulate import command as module
 from beamline.features.simulate import figure, write
-from beamline.features.simulate.scene import scan_of
+from beamline.features.simulate.write import scan_of
 from beamline.scenes.scene_file import open_scene
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
@@ -115,7 +115,7 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
 
     def stopping(*arguments: object) -> object:
         made.append(1)
-        if len(made) == 7:
+        if len(made) == 8:  # the first one showed that the scene can be exposed
             signal.raise_signal(signal.SIGINT)
         return real(*arguments)  # type: ignore[arg-type]
 
@@ -140,7 +140,7 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
 
     def ending(*arguments: object) -> object:
         made.append(1)
-        if len(made) == 7:
+        if len(made) == 8:  # the first one showed that the scene can be exposed
             raise ends
         return real(*arguments)  # type: ignore[arg-type]
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.core.events import Event
-from beamline.features.simulate.scene import scan_of
-from beamline.features.simulate.write import write_scan
+from beamline.features.simulate.write import scan_of, write_scan
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.features.tango.device import ServerPlace, device_class, push_changes
-from beamline.features.tango.served_run import SHOWN, ServedRun
+from beamline.features.tango.device import SHOWN, ServedRun, ServerPlace, device_class, push_changes
 from beamline.scan.control import Verb
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import write_volume

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from beamline.features.tango.served_run import device_state, quality
+from beamline.features.tango.device import device_state, quality
 from beamline.page.followed_run import RunValues, StampedValues
 
 

@@ -16,8 +16,7 @@ from beamline.features.trials.data import TrialData, by_parts
 from beamline.features.trials.plans import plan_in_time, plan_of_energies
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import run, shown
-from beamline.projections.held_out import with_views_held_out
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, with_views_held_out
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Energies

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,10 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.trials import launch as trial_run
 from beamline.features.trials.data import TrialData
-from beamline.features.trials.launch import compile_kernels, run_trial
+from beamline.features.trials.launch import JOB, TrialJob, compile_kernels, run_trial
 from beamline.features.trials.plans import plan
 from beamline.features.trials.trial import Trial
+from beamline.features.trials.view_choices import ViewChoice
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.prepared_views import prepared_views
@@ -57,7 +58,7 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
 ) -> None:
     monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", ""])
     compile_kernels(plan(("r2", "fbp", "sirt"), 60, 1000, "quick"), tmp_path)
-    job = pickle.loads((tmp_path / "job.pickle").read_bytes())  # noqa: S301 - written by this test
+    job = JOB.validate_json((tmp_path / "job.json").read_bytes())
     words = ("start", "fit.loss", "fit.kernel")
     kinds = [(trial.method, *(trial.settings.get(name, "") for name in words)) for trial in job.compiled]
     assert sorted(kinds) == [
@@ -65,6 +66,17 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
         ("r2", "", "poisson", ""), ("r2", "tv", "", ""), ("sirt", "", "", ""),
     ]  # fmt: skip
     assert job.data == tmp_path / "data"  # whose geometry decides which kernels are used
+
+
+def test_a_job_comes_through_its_file(tmp_path: Path) -> None:
+    groups = [[0, 1], [2, 3], [4, 5]]
+    settings = {"steps": 3, "weight": 3.0, "start": "tv", "moves": None, "fast": True}
+    trial = Trial("method", "r2", 3, 2, settings, choice=ViewChoice("means", groups), seconds_asked=1.5)
+    back = JOB.validate_json(JOB.dump_json(TrialJob(tmp_path / "data", trial, 7, tmp_path / "v.npy", [trial]))).trial
+    assert back is not None and back.choice is not None
+    assert (back.choice.label, back.choice.groups) == ("means", groups)
+    assert replace(back, choice=None) == replace(trial, choice=None)
+    assert [type(value) for value in back.settings.values()] == [int, float, str, type(None), bool]
 
 
 @pytest.mark.slow

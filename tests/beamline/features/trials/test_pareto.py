@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.trials.pareto import front, rounded, steps
+from beamline.features.trials.table import front, rounded, steps
 
 # Few distinct values, so that ties happen.
 VALUES = st.one_of(st.integers(-5, 5).map(float), st.floats(-1e6, 1e6), st.just(math.nan), st.just(math.inf))

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.energies.scans import EnergyScans
-from beamline.energies.spectra import read_spectra
+from beamline.energies.scans import EnergyScans, read_spectra
 from beamline.features.trials.data import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.table import TrialTable

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ import recon.warm_up
 from beamline.core.errors import DataError
 from beamline.features.trials import worker as module
 from beamline.features.trials.data import TrialData, write_array
-from beamline.features.trials.launch import TrialJob
+from beamline.features.trials.launch import JOB, TrialJob
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import main, on_grid, run
-from beamline.projections.held_out import with_views_held_out
+from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -54,7 +53,7 @@ def done(data: TrialData, folder: Path, trial: Trial | None = None, **more: Any)
     """The exit code of a process that runs the trial."""
     folder.mkdir(exist_ok=True)
     data.save(folder / "data")
-    (folder / "job").write_bytes(pickle.dumps(TrialJob(folder / "data", trial, **more)))
+    (folder / "job").write_bytes(JOB.dump_json(TrialJob(folder / "data", trial, **more)))
     return main(folder / "job")
 
 

@@ -76,7 +76,7 @@ def test_regions_are_the_material_and_what_is_next_to_it(tmp_path: Path) -> None
 
 
 def test_a_series_of_charges_moves_the_edge_as_the_radiographs_show_it(tmp_path: Path) -> None:
-    """By 2 eV from the discharged to the charged state, as simulators.samples.materials.edge has it."""
+    """By 2 eV from the discharged to the charged state, as simulators.samples.materials.materials has it."""
     energies = np.arange(8.320, 8.375, 0.001)
     found = []
     for charge in (0.0, 0.5, 1.0):

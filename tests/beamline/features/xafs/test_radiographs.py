@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from beamline.features.xafs.radiographs import line_integrals
+from beamline.features.xafs.series import line_integrals
 
 TRUE = np.linspace(0.0, 6.0, 12).reshape(3, 4)
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.xafs.tabulated import edge_sentence, nearest_edges
+from beamline.features.xafs.results import edge_sentence, nearest_edges
 from recon.prep.matter import edges_of
 
 LITHIUM, OXYGEN, MANGANESE, COBALT, NICKEL = 3, 8, 25, 27, 28

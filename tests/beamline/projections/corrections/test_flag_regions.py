@@ -12,11 +12,10 @@ from scipy import ndimage
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import WARNED_SHARE, regions_of
-from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection
+from beamline.projections.usable_views import WARNED_SHARE, regions_of
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import SourceOptions
 from recon.prep.resample import Resampling

@@ -13,16 +13,16 @@ import pytest
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.beam_hardening.hardening import Hardening
 from beamline.projections.corrections.calibration.calibrate import Calibrate
-from beamline.projections.corrections.flags import Flags, usable_views
 from beamline.projections.corrections.jumps.jumps import Jumps
 from beamline.projections.corrections.phase.phase import Phase
-from beamline.projections.corrections.references import Flats
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
+from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.output_paths import OutputPaths
@@ -144,13 +144,13 @@ def test_the_search_of_a_jump_takes_no_more_than_it_states(tmp_path: Path) -> No
 def test_a_scan_without_a_jump_needs_no_memory_for_it_unless_the_monitor_is_to_look(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(8, 40)))
     with open_scan(SourceOptions(path)) as source:
-        stated = [Jumps().memory(part_of(source, *steps)).alone for steps in ((), (Flags("judge"),))]
+        stated = [Jumps().memory(part_of(source, *steps)).alone for steps in ((), (Preparation("judge"),))]
     assert stated[0] == 0 < stated[1]
 
 
 def test_the_budget_counts_the_largest_step_that_is_alone_in_memory(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(4, 96)))
-    steps = Air("none"), Rings("vo"), Hardening("fit"), Flats("dynamic")
+    steps = Air("none"), Rings("vo"), Hardening("fit"), Preparation(flat_fields="dynamic")
     with open_scan(SourceOptions(path)) as source:
         stated = [step.memory(part_of(source, *steps)) for step in steps]
     found = needs(path, *steps)

@@ -11,7 +11,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import source_findings
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.references import ReferenceCheck
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import references_usable
@@ -21,7 +21,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
-ACCEPT = SELECTION.with_steps(ReferenceCheck("accept"))
+ACCEPT = SELECTION.with_steps(Preparation(references="accept"))
 FULL = 65535.0
 
 

@@ -15,7 +15,7 @@ from beamline.core.events import Event
 from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import CountModel, Defects
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
@@ -120,7 +120,7 @@ def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
 @pytest.mark.parametrize("binning", [1, 2])
 @pytest.mark.parametrize("lens", [None, Distortion(50.0, 30.0, (1.0, 3e-4, -4e-6))])
 def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion | None) -> None:
-    plain = Air("none"), Defects(zinger_threshold=1e9)  # zingers are judged by the rows that are there
+    plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
     correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
@@ -138,7 +138,7 @@ def test_what_cannot_be_levelled_is_refused() -> None:
     with pytest.raises(ConfigError, match="--tilt"):
         _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion"):
-        _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), CountModel("counts")))
+        _prepared(source, SELECTION.with_steps(TiltAndLens(1.0), Preparation(noise="counts")))
     few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
     with pytest.raises(DataError, match="was not found"):
         _prepared(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

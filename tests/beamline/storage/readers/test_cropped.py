@@ -73,7 +73,7 @@ def test_rows_are_read_as_late_as_in_the_whole_scan() -> None:
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])
 def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int, right: int) -> None:
-    from beamline.projections.corrections.flags import regions_of
+    from beamline.projections.usable_views import regions_of
 
     source: Any = CroppedSource(_Flagged(), cols)  # type: ignore[arg-type]
     assert source.axis_col == 52.5 - cols[0]

@@ -10,7 +10,7 @@ import pytest
 from beamline.features.files.describe import describe
 from beamline.features.files.validate import validate
 from beamline.monitor.check import Flag, Level
-from beamline.projections.corrections.flags import usable_views
+from beamline.projections.usable_views import usable_views
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.treatment import frames_flagged

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.samples.materials.edge import FAR, K_EDGES, NEAR, near_edge, profile
+from simulators.samples.materials.materials import FAR, K_EDGES, NEAR, near_edge, profile
 
 Reals = NDArray[np.float64]
 Z = sorted(K_EDGES)

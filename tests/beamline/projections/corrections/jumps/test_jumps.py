@@ -14,8 +14,8 @@ from beamline.monitor.digest import digest
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import Flags
 from beamline.projections.corrections.jumps.jumps import Jumps
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
@@ -99,7 +99,7 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (Selection(axis_col=23.5, steps=(Flags("ignore"),)), "--flags ignore: 1 view with an alarm"),
+        (Selection(axis_col=23.5, steps=(Preparation("ignore"),)), "--flags ignore: 1 view with an alarm"),
         (
             Selection(axis_col=23.5, steps=(Jumps("ignore"),)),
             "The monitor saw the sample jump at frame 45; --jumps ignore",

@@ -10,8 +10,8 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.counts import CountModel
 from beamline.projections.corrections.phase.phase import Phase
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource
@@ -66,7 +66,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     with pytest.raises(ConfigError, match=r"has 48 x 40"):
         replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
-        _correction(SELECTION.with_steps(CountModel("counts")))
+        _correction(SELECTION.with_steps(Preparation(noise="counts")))
 
 
 def test_a_cone_is_scaled_to_the_sample() -> None:

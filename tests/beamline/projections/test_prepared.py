@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
-from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out, with_held_out
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from tests.beamline.scans import TwoCylinders, write_exchange

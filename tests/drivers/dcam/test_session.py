@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import usb.core
 
-from drivers.dcam import usb as preflights
-from drivers.dcam.usb import Verdict, preflight
+from drivers.dcam import session as preflights
+from drivers.dcam.session import Verdict, preflight
 from tests.drivers.dcam.usb_bus import Bus, Descriptor
 
 

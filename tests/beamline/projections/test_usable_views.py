@@ -11,11 +11,11 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.flags import WARNED_WEIGHT, Flags
-from beamline.projections.held_out import hold_out
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.prepared import PreparedProjections
+from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection
+from beamline.projections.usable_views import WARNED_WEIGHT
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.treatment import FEWEST_VIEWS
 from drivers.base.frame import FrameKind
@@ -74,7 +74,7 @@ def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
-    selection = SELECTION.with_steps(Flags("ignore"))
+    selection = SELECTION.with_steps(Preparation("ignore"))
     found, told = prepared(scan(tmp_path), selection)
     assert found.geometry.n_views == 30 and found.view_weights is None and found.ray_weights() is None
     assert told[0] == "--flags ignore: 6 views with an alarm and 2 with a warning are used as they are."
@@ -95,7 +95,7 @@ def test_a_file_without_flags_is_judged_where_that_is_wanted(tmp_path: Path) -> 
     frames[9], frames[10] = (replace(frames[i], counts=frames[8].counts) for i in (9, 10))
     path = write_flagged(tmp_path / "s.h5", frames, {})
     assert prepared(path)[0].geometry.n_views == 30
-    found, told = prepared(path, SELECTION.with_steps(Flags("judge")))
+    found, told = prepared(path, SELECTION.with_steps(Preparation("judge")))
     assert found.geometry.n_views == 28 and "2 have an alarm and are left out (stuck 2 alarm)" in told[0]
 
 

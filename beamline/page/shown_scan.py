@@ -1,0 +1,217 @@
+"""ShownScan: a scan in any format on the page: its views over flats as a stack, means, and one slice for any axis."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.page.tiles import TileRegion
+from beamline.page.volume import ShownVolume, VolumeTile
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.corrections.resampling import TiltAndLens
+from beamline.projections.selection import Selection, cone_of, geometry_of
+from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.volumes.base import bare_record
+from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+from recon.base.views import spread, spread_views
+from recon.base.volume import Grid
+from recon.prep.align import closest_pair, find_axis
+from recon.voxels.direct import direct
+
+F32 = NDArray[np.float32]
+_REFERENCES = 8  # darks and flats that are averaged
+_VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
+_MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
+_NEAR = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
+_BESIDE = 2  # rows beside that of the slice, by which the axis is found
+_MISSES = math.radians(2)  # by which a pair may miss half a turn
+
+
+class _OverFlats:
+    """Views [view, row, col] as the share of the light that the sample lets through; as they are without flats.
+
+    Attributes:
+        dark, flat: means [row, col] of the first darks and flats; None without.
+        light: [view] mean of each view that was read, else NaN.
+    """
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, source: ScanSource) -> None:
+        self.source, self.frames = source, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+        if not self.frames.size:
+            raise DataError(f"{source.path} has no projections to show: `beamline info` says what its frames are.")
+        self.shape = self.frames.size, *source.shape
+        self.dark, self.flat = self._mean(FrameKind.DARK), self._mean(FrameKind.FLAT)
+        self.light = np.full(self.frames.size, np.nan)
+        self.total = np.zeros(source.shape)
+
+    def __getitem__(self, part: slice) -> F32:
+        views = read_known(self.source, self.frames[part]).astype(np.float32)
+        if self.flat is not None:
+            dark = np.float32(0) if self.dark is None else self.dark
+            with np.errstate(divide="ignore", invalid="ignore"):
+                views = (views - dark) / (self.flat - dark)
+        for at, view in zip(np.arange(self.shape[0])[part], views, strict=True):
+            if np.isnan(self.light[at]):
+                finite = np.isfinite(view)
+                self.light[at] = view[finite].mean() if finite.any() else 0.0
+                self.total += np.where(finite, view, self.light[at])
+        return views
+
+    def _mean(self, kind: FrameKind) -> F32 | None:
+        rows = spread(np.flatnonzero(self.source.image_key == kind), _REFERENCES)
+        return read_known(self.source, rows).mean(axis=0, dtype=np.float32) if rows.size else None
+
+
+class ShownScan:
+    """A scan, opened. All calls come from one thread (HDF5).
+
+    Attributes:
+        stack: its views as slices: across views, rows and columns.
+
+    Raises:
+        DataError: it has no projections.
+    """
+
+    def __init__(self, source: ScanSource) -> None:
+        self._source, self._views = source, _OverFlats(source)
+        self._degrees = np.degrees(source.angles[self._views.frames])
+        record = bare_record(source.path, self._views)
+        self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
+        self._correction: ScanCorrection | None = None
+        self._row, self._beside, self._band = -1, 0, range(0)  # of the rows that are kept
+        self._lines, self._ids = np.empty((0, 0, 0), np.float32), np.empty(0, np.int64)
+
+    def close(self) -> None:
+        self.stack.close()
+        self._source.close()
+
+    def facts(self) -> dict[str, Any]:
+        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each view so far (null:
+        not read), two views about half a turn apart and the degrees by which they miss it (null: none)."""
+        known = self._degrees[np.isfinite(self._degrees)]
+        angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles not known: give --angles"
+        over = "as they are: there are no flats" if self._views.flat is None else "over flats"
+        return {
+            "said": f"{self._source.format}, {known.size} of {self._degrees.size} views with angles, {angles}; {over}",
+            "means": [name for name, mean in self._means().items() if mean is not None],
+            "light": [None if np.isnan(each) else float(each) for each in self._views.light],
+            "pair": self._pair(),
+        }
+
+    def mean(self, kind: str) -> F32:
+        """The mean [row, col] of the views that were read so far, or of the first flats or darks.
+
+        Raises:
+            DataError: there are none.
+        """
+        if (mean := self._means().get(kind)) is None:
+            raise DataError(f"There are no {kind} to average.")
+        return mean
+
+    def axis(self, row: int) -> dict[str, Any]:
+        """The axis of the file, or as one row shows it, in columns, and where it comes from; whether it may lean.
+
+        Raises:
+            DataError: the views cannot be corrected, or have no angles.
+        """
+        self._read(row, 0.0)
+        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the detector's middle", self._cone is not None
+        if self._source.axis_col is not None:
+            axis, said = self._source.axis_col, "as the file states"
+        elif not is_cone:
+            with suppress(ValueError):
+                found = find_axis(self._lines, self._source.angles[self._ids])
+                axis, said = found.value, f"found by row {row}{'' if found.confident else ', not a clear optimum'}"
+        return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
+
+    def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
+        """A part of the slice that a row shows, by FBP with this axis; `fast`: of fewer views, with larger voxels.
+
+        Raises:
+            DataError: as `axis`.
+        """
+        self._read(row, tilt_deg)
+        every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
+        data, angles = self._lines[::every], self._source.angles[self._ids[::every]]
+        geometry = geometry_of(self._source, Selection(rows=(self._band.start, self._band.stop)), axis_col, angles)
+        whole = Grid.matching(geometry)
+        cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
+        n = cols if abs(axis_col - (cols - 1) / 2) < _NEAR * cols else whole.shape[1]  # else it jumps with each column
+        shown, most = region.inside((n, n)), _FAST_MOST if fast else _MOST
+        ends = (shown.first_row, shown.last_row), (shown.first_col, shown.last_col)
+        step = -(-max(last - begin for begin, last in ends) // most)
+        if geometry.is_cone:
+            height = (row - (self._source.shape[0] - 1) / 2) * voxel
+        else:
+            line = self._line(data, row, tilt_deg)[:, : data.shape[2] // step * step]
+            data = line.reshape(len(line), 1, -1, step).mean(axis=3)
+            at, pitch = (axis_col - (step - 1) / 2) / step, step * geometry.pixel_pitch
+            geometry = Geometry.parallel(angles, data.shape[1:], pixel_pitch=pitch, axis_col=at)
+        ny, nx = (-(-(last - begin) // step) for begin, last in ends)
+        y, x = ((begin + (m * step - n) / 2) * voxel for (begin, _), m in zip(ends, (ny, nx), strict=True))
+        values = direct(np.ascontiguousarray(data), geometry, Grid((1, ny, nx), step * voxel, (height, y, x)), "hann")
+        (top, _), (left, _) = ends
+        return VolumeTile(values[0], TileRegion(top, top + ny * step, left, left + nx * step), step, 1.0)
+
+    def _means(self) -> dict[str, F32 | None]:
+        seen = int(np.isfinite(self._views.light).sum())
+        views = (self._views.total / seen).astype(np.float32) if seen else None
+        return {"views": views, "flats": self._views.flat, "darks": self._views.dark}
+
+    def _pair(self) -> tuple[int, int, float] | None:
+        known = np.flatnonzero(np.isfinite(self._degrees))
+        pair = closest_pair(np.radians(self._degrees[known]), _MISSES) if known.size else None
+        if pair is None:
+            return None
+        one, other = known[list(pair)].tolist()
+        return one, other, float((self._degrees[other] - self._degrees[one]) % 360 - 180)
+
+    @property
+    def _cone(self) -> tuple[float, float] | None:
+        return cone_of(self._source, Selection())
+
+    def _read(self, row: int, tilt_deg: float) -> None:
+        """Correct the rows that a slice needs, which are kept for the next slices."""
+        rows, cols = self._source.shape
+        if not 0 <= row < rows:
+            raise DataError(f"Row {row} is not on a detector of {rows} rows.")
+        beside = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
+        if row == self._row and beside <= self._beside:
+            return
+        beside = 1 << (beside - 1).bit_length()  # a slider that moves on has its rows
+        near, far = row - beside, row + beside
+        if (cone := self._cone) is not None:
+            middle, half = (rows - 1) / 2, cols / 2 * (self._source.pixel_size_mm or 0.0) / cone[1]
+            edges = [middle + (row - middle) / (1 + side * half) for side in (-1, 1)]
+            near, far = min(near, math.floor(min(edges))), max(far, math.ceil(max(edges)))
+        frames = self._views.frames[np.isfinite(self._degrees)]
+        if not frames.size:
+            raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
+        if self._correction is None:
+            self._correction = ScanCorrection(self._source, Selection(), lambda _: None)
+        some, band = spread_views(self._source.angles[frames], _VIEWS, frames), range(max(near, 0), min(far + 1, rows))
+        corrected = self._correction.at_once(some, slice(band.start, band.stop))
+        self._lines, self._ids = corrected.data, corrected.view_ids
+        self._row, self._beside, self._band = row, beside, band
+
+    def _line(self, data: F32, row: int, tilt_deg: float) -> F32:
+        """The row [view, col] of views that are turned by the tilt, linear between pixels."""
+        if not tilt_deg:
+            return data[:, row - self._band.start]
+        turned = TiltAndLens(tilt_deg).of(self._source, Selection())
+        assert turned is not None
+        (rows,), (cols,) = turned.places((1, data.shape[2]), row)
+        rows, cols = np.clip(rows - self._band.start, 0, data.shape[1] - 1), np.clip(cols, 0, data.shape[2] - 1)
+        r, c = (np.minimum(at, n - 2).astype(int) for at, n in ((rows, data.shape[1]), (cols, data.shape[2])))
+        down, across = (rows - r).astype(np.float32), (cols - c).astype(np.float32)
+        upper, lower = ((1 - across) * data[:, k, c] + across * data[:, k, c + 1] for k in (r, r + 1))
+        return np.asarray((1 - down) * upper + down * lower)
