@@ -155,7 +155,7 @@ def _fine(image: F32) -> F32:
 def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
     """Values [..., col] of the columns on the other side of the axis, by cubic splines; NaN where there are none."""
     cols = values.shape[-1]
-    at = 2 * axis_col - np.arange(cols)
+    at = np.asarray(2 * axis_col - np.arange(cols), np.float64)
     opposite = value_at(spline_through(values), at.reshape((1,) * (values.ndim - 1) + (cols,)))
     return np.where((at >= 0) & (at <= cols - 1), opposite, np.nan)
 
