@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from recon.base.choices import AUTO
+from recon.base.declared_types import is_of_type, refusal, types_of
 from recon.base.method import Method
 from recon.base.method_entry import Lengths, MethodEntry
 from recon.base.registry import Registry, in_folders, unknown
@@ -138,6 +139,10 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
         if "." in name:
             outer, inner = name.split(".", 1)
             nested.setdefault(outer, {})[inner] = setting
+    kinds = types_of(method.__class__)
+    for name, value in flat.items():
+        if not is_of_type(value, kinds.get(name, Any)):
+            raise ValueError(refusal(name, value, kinds[name]))
     return replace(
         method, **flat, **{name: with_settings(getattr(method, name), inner) for name, inner in nested.items()}
     )

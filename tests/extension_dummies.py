@@ -63,7 +63,7 @@ import numpy as np
 import recon
 from click.testing import CliRunner
 from beamline.cli.recon import recon as command
-from beamline.features.trials.tradeoff_command import tradeoff
+from beamline.features.trials.command import tradeoff
 from beamline.reconstruct.option_rules import RULES, takers
 from beamline.reconstruct.outcome import label_of
 from beamline.features.trials.figures import pareto_plot

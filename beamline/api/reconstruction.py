@@ -16,8 +16,7 @@ from beamline.core.narration import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.energies.scans import EnergyScans, read_spectra
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths, report_beside
+from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.energies import scans_of
 from beamline.storage.interrupted import scan_file

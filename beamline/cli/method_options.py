@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -83,9 +82,9 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
         return Auto(tuple(method_with(each.name, settings, any_setting) for each in Auto().candidates))
     method = by_name(name)
     its_own = {path: value for path, value in settings.items() if has_setting(method, path)}
-    further = any_setting or {}
+    further = {path: tuple(value) if isinstance(value, list) else value for path, value in (any_setting or {}).items()}
     try:
-        return build(method, its_own | {path: _of_kind(method, path, value) for path, value in further.items()})
+        return build(method, its_own | further)
     except (ValueError, TypeError) as error:
         raise click.UsageError(f"--set: {error}. Nothing was computed.") from error
 
@@ -118,29 +117,11 @@ def preset_of(method: str | None, preset: str | None) -> str | None:
     return name
 
 
-def _of_kind(method: type[Method], path: str, value: Any) -> Any:
-    """The value of a setting, if it has the kind of the method's default; None leaves the choice to the method."""
-    if not has_setting(method, path):
-        return value  # `build` names the methods that have the setting
-    default: Any = method()
-    for name in path.split("."):
-        default = getattr(default, name)
-    if isinstance(default, tuple) and isinstance(value, list):
-        return tuple(value)
-    numbers, given = isinstance(default, int | float), isinstance(value, int | float)
-    fits = isinstance(default, bool) == isinstance(value, bool) and numbers == given
-    if default is not None and (
-        not fits or dataclasses.is_dataclass(default) or isinstance(default, str) != isinstance(value, str)
-    ):
-        raise ValueError(f"{path}={value!r} is not of the kind of {default!r}, the default")
-    return value
-
-
-def resumes_slabs(path: Path | None) -> bool:
-    """Whether the file of --resume is a partial volume."""
+def slabs_resumed(path: Path | None) -> Path | None:
+    """The file of --resume if it is a partial volume; else None."""
     from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
 
-    return path is not None and is_partial(path)
+    return path if path is not None and is_partial(path) else None
 
 
 preset_option = option(

@@ -7,13 +7,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from beamline.cli.method_options import method_with, preset_of, resumes_slabs, settings_of
+from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
 from beamline.cli.option_groups import Grouped
 from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, require_there, rules_of
 from beamline.cli.recipe import names_given, recipe_text, repeating
@@ -29,7 +30,7 @@ from beamline.core.shipped import version
 from beamline.core.sinks import fan_out, while_it_works
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import printable
-from beamline.reconstruct.option_rules import RULES, SLABS_RESUMED, of_other_methods
+from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, IN_TIME
@@ -91,7 +92,7 @@ def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
     cls=Grouped, first=("method", "views", "rows", "binning", "axis", "rings", "budget", "output", "follow", "dry")
 )
 @recon_options
-def recon(file: Path, method: str | None, output: Path | None, **values: Any) -> None:
+def recon(**values: Any) -> None:
     """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of TIFFs, .txrm.
 
     HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
@@ -103,18 +104,14 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
 
     --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
-    context = click.get_current_context()
-    slabs = values["resume"] if resumes_slabs(values["resume"]) else None
-    method = _checked_method(context, method, slabs)
-    path = output or Path(f"{file.stem}_{method}.h5")
-    if not values["follow"] and values["write_config"] is None and values["log"] is None:  # a log holds the failure
-        require_there(file, values["as_json"])
-    options = _options(context, file, method, path, values)
+    # A log holds the failure of a scan that is not there, and a recipe needs none.
+    there = not values["follow"] and values["write_config"] is None and values["log"] is None
+    options = options_of(click.get_current_context(), there=there)
     if values["write_config"] is not None:
-        if output is not None:
+        if values["output"] is not None:
             options.target.refuse_existing()
         _write_recipe(values["write_config"], options.recipe)
-        if output is None:
+        if values["output"] is None:
             return
     if values["dry"]:
         if values["log"] is not None:
@@ -124,36 +121,65 @@ def recon(file: Path, method: str | None, output: Path | None, **values: Any) ->
         run_reconstruction(options, values)
 
 
-def options_of(context: click.Context, default: str = "") -> ReconOptions:
-    """The options of the reconstruction that a context of `recon` asks for; see `_checked_method`."""
-    values = dict(context.params)
-    file, method, output = (values.pop(name) for name in ("file", "method", "output"))
-    slabs = values["resume"] if resumes_slabs(values["resume"]) else None
-    method = _checked_method(context, method, slabs, default)
-    return _options(context, file, method, output or Path(f"{file.stem}_{method}.h5"), values)
+def options_of(context: click.Context, default: str = "", *, there: bool = False) -> ReconOptions:
+    """The options of the reconstruction that a context of `recon` asks for.
+
+    Args:
+        default: the method where none is named; empty: the usual one for such options.
+        there: the scan must be there, which is looked at before the libraries that compute are loaded.
+
+    Raises:
+        UsageError: options do not go together, a file is named twice, or the method cannot do what is asked.
+        DataError: the scan is not there.
+    """
+    values, file = dict(context.params), context.params["file"]
+    method = _checked_method(context, default)
+    path = values["output"] or Path(f"{file.stem}_{method}.h5")
+    if there:
+        require_there(file, values["as_json"])
+    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
+    from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
+    from recon.voxels.enough_views import Goal
+
+    page = report_beside(path) if values["report"] else None
+    files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
+    files |= {"--resume": values["resume"], "--log": values["log"], "--write-config": values["write_config"]}
+    refuse_shared(files)
+    partial, goal = slabs_resumed(values["resume"]), (values["enough_gain"], values["enough_loss"])
+    source, selection = chosen(file, values["seed"], values)
+    settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
+    built = method_with(method, settings, values["any_setting"])
+    if values["region"] is not None and values["max_residual"] is not None and built.traits.direct:
+        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
+    same = {each.name: values[each.name] for each in fields(ReconOptions) if each.name in values}
+    return ReconOptions(**same | {
+        "source": source, "target": OutputPaths(path, page), "selection": selection, "method": built,
+        "checkpoints": CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
+        "enough": None if goal == (None, None) else Goal(*goal), "partial": partial,
+        "follow": FollowTiming() if values["follow"] else None, "recipe": recipe_text(context, method),
+        "command": repeating(context, file, path, () if partial is None else ("resume",)),
+    })  # fmt: skip
 
 
-def _checked_method(context: click.Context, method: str | None, slabs: Path | None, default: str = "") -> str:
+def _checked_method(context: click.Context, default: str = "") -> str:
     """The method's name, after all options were found to go together and with it.
 
     Args:
-        slabs: partial volume that --resume names.
         default: the method where none is named; empty: the usual one for such options.
 
     Raises:
         UsageError: they do not.
     """
-    asked, rules = names_given(context), rules_of(context.command)
-    if slabs is not None:
+    asked, rules, values = names_given(context), rules_of(context.command), context.params
+    if slabs_resumed(values["resume"]):
         asked = asked - {"resume"} | {SLABS_RESUMED}
-    values = context.params
-    method = preset_of(method, values["preset"])
+    method = preset_of(values["method"], values["preset"])
     stated = method is not None
     if method is None:
         of_a_method = {name for name, rule in rules.items() if rule.of_methods}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget"}
         method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
-    refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {slabs}"})
+    refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
     if why := of_other_methods(rules, asked, method, stated=stated):
         raise click.UsageError(why)
     for step in chosen_steps(values) if values["follow"] else ():
@@ -172,49 +198,7 @@ def refuse_recipe(config: Path) -> None:
     """Raise UsageError for a recipe whose options do not go together, or with a volume, whatever the scan."""
     with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
         values = dict(context.params)
-        method = _checked_method(context, values["method"], None)
-        method_with(method, settings_of(recon, values), values["any_setting"])
-
-
-def _options(context: click.Context, file: Path, method: str, path: Path, values: Mapping[str, Any]) -> ReconOptions:
-    """The options of the reconstruction; `values` of the command's parameters.
-
-    Raises:
-        UsageError: a file is named twice, or the method cannot do what is asked.
-    """
-    from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
-    from beamline.reconstruct.options import FollowTiming, ReconOptions
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
-    from recon.voxels.enough_views import Goal
-
-    page = report_beside(path) if values["report"] else None
-    files = {"FILE": file, "--output": path, "report": page, "--checkpoint": values["checkpoint"]}
-    files |= {"--resume": values["resume"], "--log": values["log"], "--write-config": values["write_config"]}
-    refuse_shared(files)
-    partial = values["resume"] if resumes_slabs(values["resume"]) else None
-    source, selection = chosen(file, values["seed"], values)
-    settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
-    built = method_with(method, settings, values["any_setting"])
-    if values["region"] is not None and values["max_residual"] is not None and built.traits.direct:
-        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
-    goal = values["enough_gain"], values["enough_loss"]
-    return ReconOptions(
-        source=source,
-        target=OutputPaths(path, page),
-        selection=selection,
-        method=built,
-        checkpoints=CheckpointOptions(values["checkpoint"], None if partial else values["resume"]),
-        enough=None if goal == (None, None) else Goal(*goal),
-        partial=partial,
-        follow=FollowTiming() if values["follow"] else None,
-        command=repeating(context, file, path, () if partial is None else ("resume",)),
-        recipe=recipe_text(context, method),
-        filter=values["filter"],
-        seed=values["seed"],
-        **{
-            rule.value: values[rule.value] for rule in RULES.values() if rule.value in values and rule.value != "follow"
-        },
-    )
+        method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
 
 
 def run_reconstruction(

@@ -1,4 +1,4 @@
-"""Options that choose a part of a scan and its corrections; the same for every command that reconstructs."""
+"""Options of a scan, its part and its corrections; the same for every command that opens one or reconstructs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of the beam monitor: the keys that all kinds share."""
+"""Configuration of what stands in the beam: its monitor, shutters and the monochromator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This machine: its description for measured figures, and its free and used memory."""
+"""This machine: its description, its memory, and the time, memory and disk space that a piece of work needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scans of one sample at several energies: a source of views, with the energy of each."""
+"""Scans of one sample at several energies: their spectra, and a source of views with the energy of each."""
 
 from __future__ import annotations
 

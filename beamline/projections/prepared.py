@@ -1,4 +1,4 @@
-"""Prepared projections: line integrals ready for reconstruction, with their geometry and the weights of their rays."""
+"""Prepared projections: line integrals ready for reconstruction, weights of their rays, and views held out."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from beamline.core.events import Sink, StateEntered
 from beamline.core.sinks import Note, event_of_sentence
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
+from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.outcome import ReportContext
-from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.remarks import (
     hiding_warning,
     lost_mass_warning,

@@ -33,8 +33,7 @@ from beamline.reconstruct.memory import (
     refuse_whole,
     surely_weighted,
 )
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.several_scans import SeveralScans, scans_of, views_of_others, with_as_many_views
 from beamline.reconstruct.workers import cluster

@@ -1,4 +1,4 @@
-"""Run: a method on prepared views, the one call by which every command makes a volume."""
+"""Run: a method on prepared views, the one call by which every command makes a volume, and its share of the time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import recon
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections, with_held_out
 from beamline.reconstruct.measure import residual_share
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.arrays import F32

@@ -1,4 +1,4 @@
-"""Supervision: causes that pause or end a scan beside its operator, and the effects of the monitor's alarms."""
+"""Supervision: causes that pause or end a scan: beam monitor, as its log reads it, and alarms of frames."""
 
 from __future__ import annotations
 

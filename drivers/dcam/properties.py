@@ -1,4 +1,4 @@
-"""Properties of one DCAM camera: set, read back and compare; a refusal lists the legal values."""
+"""Properties of one DCAM camera: set, read back and compare; the wait until its sensor is cold."""
 
 from __future__ import annotations
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from drivers import orca_quest
 from drivers.base.protocols import CameraSettings
-from simulators.frame.detector import CONVERSION, Detector
+from simulators.frame.detector import Detector
+from simulators.frame.sensor import CONVERSION
 from simulators.frame.shot import AngleAt, Shot
 from simulators.scenes.scene import Scene
 

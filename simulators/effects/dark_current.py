@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
-from simulators.frame.detector import DARK_CURRENT
 from simulators.frame.mapping import NotNegative
+from simulators.frame.sensor import DARK_CURRENT
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from simulators.effects.chain import ImageEffect
-from simulators.frame.detector import OFFSET
 from simulators.frame.mapping import NotNegative, Whole
+from simulators.frame.sensor import OFFSET
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
-from simulators.frame.detector import READ_NOISES
 from simulators.frame.mapping import NotNegative, Whole
+from simulators.frame.sensor import READ_NOISES
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal
 from simulators.pixels.pattern import binned, normals

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
-from simulators.frame.detector import FULL_WELL
 from simulators.frame.mapping import Positive, Share
+from simulators.frame.sensor import FULL_WELL
 from simulators.frame.shot import Image, Shot
 
 

@@ -23,8 +23,7 @@ from beamline.core.stop import StopRequest
 from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct.live_fit import ScanFollower
-from beamline.reconstruct.options import FollowTiming, ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan

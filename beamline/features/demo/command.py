@@ -150,8 +150,8 @@ def _compare(
     from beamline.gaussians.model import read_model
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
+    from beamline.reconstruct.options import OutputPaths, report_beside
     from beamline.reconstruct.outcome import ReportContext, facts_of
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from beamline.reconstruct.result import axis_of, write_result
     from beamline.report.record import history_from
     from beamline.storage.readers.open import open_scan

@@ -1,4 +1,4 @@
-"""Films: grey images one after another in an animated GIF, or in an MP4 where the machine has ffmpeg."""
+"""Films: grey images, such as the views of a scan, in an animated GIF, or in an MP4 where there is ffmpeg."""
 
 from __future__ import annotations
 

@@ -71,8 +71,7 @@ def materials(files: tuple[Path, ...], spectra: Path, output: Path, **values: An
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
     from beamline.energies.scans import EnergyScans, read_spectra
-    from beamline.reconstruct.options import ReconOptions
-    from beamline.reconstruct.output_paths import OutputPaths, report_beside
+    from beamline.reconstruct.options import OutputPaths, ReconOptions, report_beside
     from beamline.scan.energies import scans_of
     from recon.features.joint.methods import EnergySeries
 

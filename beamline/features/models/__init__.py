@@ -11,7 +11,7 @@ COMMANDS = {
         Libraries.FITS,
     ),
     "surface": CommandEntry(
-        "beamline.features.models.surface_command",
+        "beamline.features.models.command",
         "Write the surface of a volume, or of its Gaussians, as a watertight mesh.",
         Libraries.FILES,
     ),

@@ -1,4 +1,4 @@
-"""What is made of the Gaussians behind a volume: voxels of any grid, and views."""
+"""What is made of the Gaussians behind a volume: voxels of any grid, views, and surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes a simulated scan frame by frame into a file like an instrument's, with the labels of its anomalies."""
+"""Writes the scan of a scene frame by frame into a file like an instrument's; what a frame costs."""
 
 from __future__ import annotations
 

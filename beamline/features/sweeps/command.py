@@ -150,7 +150,7 @@ def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
 
 def _options(context: click.Context) -> ReconOptions:
     """The options of one reconstruction, of which no volume is written."""
-    from beamline.reconstruct.output_paths import OutputPaths
+    from beamline.reconstruct.options import OutputPaths
 
     if foreign := sorted(names_given(context) & _OF_A_VOLUME):
         raise click.UsageError(f"--{foreign[0]} is of a volume, and a sweep makes slices.")

@@ -19,8 +19,7 @@ from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, F64

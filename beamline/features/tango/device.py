@@ -1,4 +1,4 @@
-"""The Tango device of a run (pytango), its server, and what clients may ask the scan for."""
+"""The Tango device of a run (pytango), the run that it serves, and what clients may ask the scan for."""
 
 from __future__ import annotations
 

@@ -6,12 +6,12 @@ from beamline.cli.commands import CommandEntry, Libraries
 
 COMMANDS = {
     "tradeoff": CommandEntry(
-        "beamline.features.trials.tradeoff_command",
+        "beamline.features.trials.command",
         "Compare methods and settings on a scan: quality against time and memory.",
         Libraries.FITS,
     ),
     "study": CommandEntry(
-        "beamline.features.trials.study_command",
+        "beamline.features.trials.command",
         "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan.",
         Libraries.FITS,
     ),

@@ -18,7 +18,7 @@ from beamline.core.machine import Need, free_memory
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
 from beamline.core.text import count, size
-from beamline.features.trials.data import TrialData
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.plans import expected_seconds
 from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import Trial

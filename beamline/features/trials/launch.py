@@ -1,20 +1,197 @@
-"""Runs each trial in a process of its own, ends it in time, and turns its output into an outcome."""
+"""The data that all trials of a scan share, and the process of each, which gets them through a folder."""
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, ProcessEnd, json_object, last_line, with_our_path
 from beamline.features.trials.trial import Outcome, Status, Trial
+from beamline.features.trials.view_choices import ViewChoice
+from beamline.projections.prepared import PreparedProjections
+from recon.base.arrays import F32, F64, I64
+from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.base.method import Energies
+from recon.prep.correct import Projections
+from recon.prep.emission import Emission, weighted_lines
+
+VolumeAt = Callable[[float], F32]
+"""The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""
+_VALUES = "values.json"
+_SMALL = 4096  # bytes of a file that is read at once
+
+
+@dataclass(frozen=True, eq=False)
+class TrialData:
+    """What every trial of a scan shares.
+
+    Attributes:
+        prepared: the views that may be used, those that no trial uses as its views held out, and what is known of
+            both, without what the monitor says of views: trials are compared by all rays alike.
+        truth: the volume [z, y, x] on Grid.matching(geometry).
+        shown_held_out: [view] of those held out as `shown` of the others; None: 0.
+        references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
+        regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
+    """
+
+    prepared: PreparedProjections
+    truth: F32 | None
+    shown_held_out: F64 | None = None
+    references: Mapping[str, F32] = field(default_factory=dict)
+    regions: NDArray[np.int8] | None = None
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of the views that may be used."""
+        return self.prepared.geometry
+
+    @property
+    def shown(self) -> F64:
+        """[view] time in s, or number of the energy, of the views that may be used; 0: all show the same volume."""
+        if (energies := self.prepared.energies) is not None:
+            return energies.of_view.astype(np.float64)
+        return np.zeros(self.geometry.n_views) if self.prepared.times is None else self.prepared.times
+
+    @property
+    def rays_held_out(self) -> F32 | None:
+        """Weights of the rays of the views held out; None: all alike."""
+        held_out = self.prepared.held_out
+        rays = None if held_out is None else self.prepared.ray_weights(held_out[1].n_views)
+        return None if rays is None else rays[self.geometry.n_views :]
+
+    def save(self, folder: Path) -> None:
+        """Into a new folder: each array in a .npy file, numbers and words in one of JSON, without how it was prepared.
+
+        Raises:
+            DataError: the disk did not take it.
+        """
+        views = self.prepared
+        parts: dict[str, Any] = {
+            "data": self, "prepared": views, "projections": views.projections, "emission": views.emission,
+            "energies": views.energies,
+        }  # fmt: skip
+        values = {
+            f"{part}.{each.name}": getattr(of, each.name) for part, of in parts.items() if of for each in fields(of)
+        }
+        values |= {f"geometry.{name}": value for name, value in arrays_of(self.geometry).items()}
+        if views.held_out is not None:
+            unseen = {f"unseen.{name}": value for name, value in arrays_of(views.held_out[1]).items()}
+            values |= {"held_out.lines": views.held_out[0], **unseen}
+        plain = {name: value for name, value in values.items() if isinstance(value, str | float | int | np.generic)}
+        with named_on_failure(folder):
+            folder.mkdir()
+            (folder / _VALUES).write_text(json.dumps(plain, default=np.generic.item), encoding="utf-8")
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                write_array(folder / f"{name}.npy", value)
+
+    @classmethod
+    def load(cls, folder: Path) -> TrialData:
+        """What `save` of the same program wrote; large arrays stay in their files until they are used."""
+        values = json.loads((folder / _VALUES).read_text(encoding="utf-8")) | {
+            path.stem: np.load(path, "r" if path.stat().st_size > _SMALL else None) for path in folder.glob("*.npy")
+        }
+
+        def of(part: str) -> dict[str, Any]:
+            return {name.removeprefix(f"{part}."): v for name, v in values.items() if name.startswith(f"{part}.")}
+
+        geometry = geometry_of_arrays(of("geometry"))
+        prepared = PreparedProjections(
+            Projections(**of("projections")),
+            geometry,
+            axis=None,
+            held_out=(held["lines"], geometry_of_arrays(of("unseen"))) if (held := of("held_out")) else None,
+            emission=Emission(geometry=geometry, **counted) if (counted := of("emission")) else None,
+            energies=Energies(**energies) if (energies := of("energies")) else None,
+            **of("prepared"),
+        )
+        return cls(prepared, **{"truth": None, **of("data")}, references=of("reference"))
+
+
+def write_reference(folder: Path, method: str, volume: F32) -> None:
+    """A volume that trials of the method are compared with, beside data that were saved."""
+    write_array(folder / f"reference.{method}.npy", volume)
+
+
+def write_regions(folder: Path, regions: NDArray[np.int8]) -> None:
+    """The dense and the empty regions, beside data that were saved."""
+    write_array(folder / "data.regions.npy", regions)
+
+
+def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
+    """The views of a row of a study, each the mean of a window of views.
+
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms. Counts
+    of an emission are added. A ray weighs as the least of its window.
+    """
+    groups = np.array(choice.groups)
+    middle = prepared.of_views(groups[:, choice.window // 2])
+    if choice.window == 1 and prepared.emission is None:
+        return middle
+    angles = prepared.geometry.angles[groups].mean(axis=1)
+    angles.setflags(write=False)
+    geometry, whole = replace(middle.geometry, angles=angles), prepared.projections
+    if prepared.emission is not None:
+        emission = prepared.emission.summed(groups, geometry)
+        lines, weights = weighted_lines(emission)
+        return replace(
+            middle,
+            projections=replace(middle.projections, data=lines, weights=weights),
+            geometry=geometry,
+            emission=emission,
+        )
+    counted = whole.weights
+    least = None if counted is None else np.stack([counted[group].min(axis=0) for group in groups])
+    means = np.stack([_mean(np.asarray(whole.data[group])) for group in groups])
+    return replace(middle, projections=replace(middle.projections, data=means, weights=least), geometry=geometry)
+
+
+def _mean(views: F32) -> F32:
+    """The line integrals [row, col] of the mean transmission of some views [view, row, col]."""
+    least = views.min(axis=0)  # taken out before the exponential, which would be 0 behind much matter
+    return np.asarray(least - np.log(np.exp(least - views).mean(axis=0)), np.float32)
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write a .npy file. `np.save` of a path loses the last 4 kB where the disk is full, and says nothing.
+
+    Raises:
+        DataError: the disk did not take it.
+    """
+    with named_on_failure(path), path.open("wb") as file:
+        np.save(SimpleNamespace(write=file.write), array, allow_pickle=False)
+
+
+def by_parts(count: int, data: TrialData, fit: Callable[[PreparedProjections], F32]) -> VolumeAt:
+    """A volume of each part of the views: of each energy, or of so long, with linear change between their middles."""
+    shown = data.shown
+    if data.prepared.energies is None:
+        edges = np.arange(count + 1) * shown.size // count
+        in_order = np.argsort(shown, kind="stable")
+        parts: list[I64] = [np.sort(in_order[first:stop]) for first, stop in pairwise(edges.tolist())]
+    else:
+        parts = [np.flatnonzero(shown == energy) for energy in range(count)]
+    volumes = np.stack([fit(data.prepared.of_views(at)) for at in parts])
+    middles = np.array([shown[at].mean() for at in parts])
+    return lambda view: np.tensordot(_linear(view, middles), volumes, 1)
+
+
+def _linear(at: float, knots: F64) -> F32:
+    return np.array([np.interp(at, knots, row) for row in np.eye(knots.size)], np.float32)
+
 
 DATA = "data"
 """Name of the folder with the `TrialData` that all trials read, in the folder of the results."""

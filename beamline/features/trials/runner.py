@@ -17,8 +17,7 @@ from beamline.core.events import Done, Event, Sink, StateEntered, TrialReached
 from beamline.core.files import refuse_existing
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
-from beamline.features.trials.data import TrialData, write_reference, write_regions
-from beamline.features.trials.launch import DATA, compile_kernels, run_trial
+from beamline.features.trials.launch import DATA, TrialData, compile_kernels, run_trial, write_reference, write_regions
 from beamline.features.trials.layout import TableLayout, event_of, write_page, write_table
 from beamline.features.trials.plans import Expected, Timed, expected_seconds, trials_left
 from beamline.features.trials.table import TrialTable

@@ -15,9 +15,9 @@ from beamline.core.events import Sink, StudyStarted
 from beamline.core.files import REPORT
 from beamline.core.machine import machine
 from beamline.core.sinks import Warn
-from beamline.features.trials.data import TrialData
 from beamline.features.trials.figures import against_cost, figures_of_rows
 from beamline.features.trials.front import dose_columns
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.layout import TableColumn, TableLayout, records
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable

@@ -16,8 +16,8 @@ from beamline.core.machine import machine
 from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.energies.scans import EnergyScans, prepare_energies, views_of
-from beamline.features.trials.data import TrialData
 from beamline.features.trials.front import TRADEOFF
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.plans import (
     Depth,
     expected_seconds,

@@ -28,8 +28,7 @@ import recon
 from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.process import at_end_of
-from beamline.features.trials.data import TrialData, VolumeAt, averaged, by_parts, write_array
-from beamline.features.trials.launch import JOB
+from beamline.features.trials.launch import JOB, TrialData, VolumeAt, averaged, by_parts, write_array
 from beamline.features.trials.trial import Trial
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import squares_left

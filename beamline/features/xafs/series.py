@@ -1,4 +1,4 @@
-"""Series: computes a curve from radiographs energy by energy, with progress events and an early end."""
+"""Series: computes a curve from radiographs in an HDF5 file, energy by energy, with progress and an early end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""surface: where a volume crosses a level, as a closed mesh of triangles; marching cubes, slab by slab."""
+"""surface: where a volume, or the density of Gaussians, crosses a level, as a closed mesh; marching cubes by slabs."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 
 from beamline.features.trials import runner
-from beamline.features.trials.data import write_array
+from beamline.features.trials.launch import write_array
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.report import figures
 from tests.beamline.conftest import BlankCanvas
@@ -44,7 +44,7 @@ _MODULES = {
     "archive": "features.archive.command",
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
     "segment": "features.particles.command",
-    "tradeoff": "features.trials.tradeoff_command features.trials.tradeoff",
+    "tradeoff": "features.trials.command features.trials.tradeoff",
     "study": "features.trials.study_command features.trials.study features.trials.figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path) -> None:
     """The same volume and the same views: one figure, and one label."""
-    sweep, data_of = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.data")
+    sweep, data_of = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.launch")
     worker = pytest.importorskip("beamline.features.trials.worker")
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"

@@ -18,8 +18,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import key_of, options_of
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, SLABS_RESUMED, OptionRule, takers
-from beamline.reconstruct.options import FollowTiming, ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions
 from beamline.reconstruct.region import Region
 from beamline.storage.readers.open import SourceOptions
 from recon.base.method import Method, Traits

@@ -16,8 +16,7 @@ import pytest
 from beamline.cli import recon as log
 from beamline.cli.recipe import repeating
 from beamline.features.particles.command import segment
-from beamline.features.trials.study_command import study
-from beamline.features.trials.tradeoff_command import tradeoff
+from beamline.features.trials.command import study, tradeoff
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange

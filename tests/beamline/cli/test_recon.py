@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
-from beamline.reconstruct.output_paths import report_beside
+from beamline.reconstruct.options import report_beside
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr

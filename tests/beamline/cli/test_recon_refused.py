@@ -56,9 +56,14 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
     "a setting without a value": ({}, ["-m", "r2", "--set", "fit.decay"], 2, "expected NAME=VALUE"),
     "a setting that there is not": ({}, ["-m", "r2", "--set", "fit.magic=1"], 2, "'fit.magic' is unknown; legal:"),
-    "a setting of another kind": ({}, ["-m", "r2", "--set", "fit.policy.every=often"], 2, "not of the kind of 100"),
+    "a setting of another kind": (
+        {},
+        ["-m", "r2", "--set", "fit.policy.every=often"],
+        2,
+        "every must be a whole number",
+    ),
     "a setting out of range": ({}, ["-m", "r2", "--set", "fit.decay=-1"], 2, "decay must be finite and above 0"),
-    "a part of settings": ({}, ["-m", "r2", "--set", "fit=3"], 2, "not of the kind of FitSettings"),
+    "a part of settings": ({}, ["-m", "r2", "--set", "fit=3"], 2, "fit must be a FitSettings, got 3"),
     "a preset of another method": ({}, ["-m", "fbp", "--preset", "published"], 2, "--preset published is of r2"),
     "iterations of fbp": (
         {},
@@ -135,7 +140,7 @@ def test_a_disk_that_is_too_small_is_told_before_the_work(folder: Path, monkeypa
     class Full(NamedTuple):
         free: int
 
-    monkeypatch.setattr("beamline.reconstruct.output_paths.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
+    monkeypatch.setattr("beamline.reconstruct.options.shutil.disk_usage", lambda _: Full(2 * 40 * 40 * 4 - 1))
     result = beamline("recon", "scan.h5", "-m", "fbp")
     assert result.exit_code == 5
     assert "The volume takes 12.8 kB, the disk of scan_fbp.h5 has 12.8 kB free" in result.stderr

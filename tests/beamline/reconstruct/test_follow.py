@@ -23,7 +23,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
 from beamline.reconstruct.live_fit import FollowState, ScanFollower
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction

@@ -13,8 +13,7 @@ from beamline.cli.terminal import results
 from beamline.core.events import Event, VolumeDone
 from beamline.core.stop import StopOnSignal
 from beamline.projections.selection import Selection
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import ReconRecord

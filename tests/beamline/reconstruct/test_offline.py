@@ -18,8 +18,7 @@ from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import checkpoints, job
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import read_checkpoint

@@ -19,8 +19,8 @@ from beamline.page.volume import ShownVolume
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.outcome import ReportContext, facts_of
-from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.result import write_result
 from beamline.report import figures
 from beamline.storage.readers.open import SourceOptions

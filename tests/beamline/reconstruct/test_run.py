@@ -16,8 +16,7 @@ from beamline.core.events import Event
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import run as in_time
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.run import fit_within, warnings_told
 from beamline.storage.readers.open import SourceOptions

@@ -21,8 +21,7 @@ import pytest
 from beamline.projections.selection import Selection
 from beamline.reconstruct import estimate, result
 from beamline.reconstruct import memory as module
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers import partial_volume

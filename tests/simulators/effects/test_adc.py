@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from simulators.effects.adc import Adc
-from simulators.frame.detector import digitise
+from simulators.frame.sensor import digitise
 from simulators.frame.shot import CannotExposeError
 from tests.simulators import chance, shots
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from simulators.effects.motion_blur import MotionBlur
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from simulators.frame.detector import Detector
 from simulators.scenes.expose import expose
 from tests.simulators import shots

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from simulators.effects.quantum_efficiency import QuantumEfficiency
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
 from simulators.effects.chain import Chain
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Shot

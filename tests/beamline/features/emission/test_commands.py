@@ -15,7 +15,7 @@ import recon
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.core.voxel_kind import VoxelKind
-from beamline.features.trials.data import TrialData
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.tradeoff import TradeoffOptions, run_tradeoff, split
 from beamline.features.trials.trial import Trial

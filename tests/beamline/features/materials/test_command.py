@@ -22,8 +22,7 @@ from beamline.energies.scans import read_spectra
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.job import progress_events
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.reconstruct.region import Region
 from beamline.storage.volumes.files import opened_volume

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beamline.features.trials.data import TrialData, write_reference, write_regions
+from beamline.features.trials.launch import TrialData, write_reference, write_regions
 from recon.base.geometry import Geometry
 from recon.base.method import Energies
 from recon.prep.emission import Emission

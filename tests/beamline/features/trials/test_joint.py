@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from beamline.features.trials import worker
-from beamline.features.trials.data import TrialData, by_parts
+from beamline.features.trials.launch import TrialData, by_parts
 from beamline.features.trials.plans import plan_in_time, plan_of_energies
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.worker import run, shown

@@ -12,8 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.trials import launch as trial_run
-from beamline.features.trials.data import TrialData
-from beamline.features.trials.launch import JOB, TrialJob, compile_kernels, run_trial
+from beamline.features.trials.launch import JOB, TrialData, TrialJob, compile_kernels, run_trial
 from beamline.features.trials.plans import plan
 from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice

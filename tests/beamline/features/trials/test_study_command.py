@@ -15,8 +15,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.features.trials import runner
-from beamline.features.trials.data import TrialData, averaged
-from beamline.features.trials.launch import DATA
+from beamline.features.trials.launch import DATA, TrialData, averaged
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import measured
 from beamline.report.slice_sheet import SliceSheet

@@ -10,7 +10,7 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.energies.scans import EnergyScans, read_spectra
-from beamline.features.trials.data import TrialData
+from beamline.features.trials.launch import TrialData
 from beamline.features.trials.runner import ComparedScan
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff

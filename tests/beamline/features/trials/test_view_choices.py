@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.trials.data import averaged
+from beamline.features.trials.launch import averaged
 from beamline.features.trials.view_choices import STUDIES, ViewChoice, ViewSet
 from recon.base.geometry import Geometry
 from tests.beamline.prepared_views import prepared_views

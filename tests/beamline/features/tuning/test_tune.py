@@ -15,7 +15,7 @@ from beamline.features.tuning.tune import TARGET, evaluate, tune
 from beamline.instrument.connect import connect
 from beamline.monitor.references import ReferenceLimits
 from drivers.base.frame import Frame, FrameKind
-from simulators.frame.detector import CONVERSION, OFFSET
+from simulators.frame.sensor import CONVERSION, OFFSET
 from tests.beamline.acquired import assert_safe
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import small

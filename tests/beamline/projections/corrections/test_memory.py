@@ -24,8 +24,7 @@ from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.step import StepMemory
 from beamline.projections.usable_views import usable_views
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.features.models.surface_command import write_mesh
+from beamline.features.models.command import write_mesh
 from beamline.storage.meshes.reading import read_mesh
 from recon.features.surfaces.marching import Mesh
 from tests.simulators.samples.voxels.test_mesh import sphere

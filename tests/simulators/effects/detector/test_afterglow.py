@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from simulators.effects.detector.afterglow import Afterglow, gauss_rule
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from simulators.frame.shot import Moments
 from tests.simulators import shots
 

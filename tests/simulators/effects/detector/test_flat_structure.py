@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simulators.effects.detector.flat_structure import FlatStructure
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from simulators.frame.detector import Detector
 from simulators.frame.shot import Shot, fixed_rng
 from tests.simulators import shots

@@ -8,7 +8,7 @@ import pytest
 from drivers import orca_quest
 from drivers.base.protocols import CameraSettings, TriggerSource
 from simulators.effects.detector.rolling_shutter import RollingShutter
-from simulators.frame import detector as sensor
+from simulators.frame import sensor
 from simulators.frame.shot import Moments
 from tests.simulators import shots
 
