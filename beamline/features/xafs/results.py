@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamline.core.files import refuse_existing, write_whole
-from beamline.features.xafs.contrast import XafsCurve
-from beamline.features.xafs.edge import AbsorptionEdge
+from beamline.features.xafs.contrast import AbsorptionEdge, XafsCurve
 from beamline.report.figures import WIDTH, new_figure, png
 from recon.prep.matter import HEAVIEST, TabulatedEdge, edges_of
 
