@@ -1,4 +1,9 @@
-"""The end of a scan's file: how the scan ended, which triggers gave no frame and why, and its frames as /exchange."""
+"""The end of a scan's file: how the scan ended, which triggers gave no frame and why, and its frames as /exchange.
+
+/exchange is the layout of De Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and
+analyzed data", J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, col] and theta in degrees, as
+virtual datasets without a copy.
+"""
 
 from __future__ import annotations
 
