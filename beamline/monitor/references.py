@@ -31,7 +31,7 @@ ZINGER = 12.0  # times the median change: more is not noise
 BY_CHANCE = 20  # pixels that hold the largest count by chance: 2 or 3 of a thousand as of a million, at CLIPPED_NOISE
 CLIPPED_NOISE = 2.0  # counts: with more noise a pixel holds one count in two frames by chance in one of seven at most
 WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
-ZINGERS = 2  # places or pixels of a frame that they hit, however small it is
+ZINGERS = 4  # places or pixels of a frame that they hit, however small it is
 
 
 @dataclass(frozen=True)
@@ -224,22 +224,21 @@ def full_scale(largest: float) -> float:
 
 
 def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    if all(map(_of_one_number, flats)):
-        if all(map(_of_one_number, darks or ())) or not flats[0].rounding:
-            return None  # written, not exposed: the number that stands for all light, such as the full scale of 16 bits
-        sentence = (
-            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there, and the "
-            "light is not known. Shorten the exposure, or look for what cut the counts off."
-        )
-        return ReferenceFault(FaultKind.SATURATED, 1.0, limits.saturated, sentence)
+    written = all(map(_of_one_number, flats))
+    if written and (all(map(_of_one_number, darks or ())) or not flats[0].rounding):
+        return None  # not exposed: the number that stands for all light, such as the full scale of 16 bits
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score, limit = float(np.median([flat.saturated for flat in flats])) - hot, saturation_limit(flats[0], limits)
-    if score <= limit:
+    if score > limit:
+        what = f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known."
+    elif written:
+        score, what = (
+            1.0,
+            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there.",
+        )
+    else:
         return _clipped(flats, darks, limits)
-    sentence = (
-        f"{score:.2%} of their pixels are saturated (limit {limit:.2%}), so that their light is not known. "
-        "Shorten the exposure or add a filter."
-    )
+    sentence = f"{what} Shorten the exposure or add a filter."
     return ReferenceFault(FaultKind.SATURATED, score, limit, sentence)
 
 

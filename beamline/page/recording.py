@@ -94,6 +94,7 @@ class Recording:
             "preview_bin": self.preview_bin,
             "pixel_mm": pixel,
             "axis_col": None if axis is None else _json_number(axis[()]),
+            "monitored": hdf5.text_at(self._file, "/entry/record/plan") not in ("", "{}"),
             "checks": [
                 {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(self._file)
             ],

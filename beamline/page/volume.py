@@ -257,8 +257,8 @@ class ShownVolume:
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
             "because": str(self._parameters.get("chosen_because", "")),
-            "angles": [float(each) if np.isfinite(each) else None for each in self._parameters.get("angles_deg", ())],
-            "unseen_deg": np.asarray(self._parameters.get("unseen_deg", ()), np.float64).tolist(),
+            "angles": [None if np.isnan(each) else each for each in self._numbers("angles_deg")],
+            "unseen_deg": self._numbers("unseen_deg"),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "seconds": self._seconds,
             "coarse_bin": self._slices[0].bin,
@@ -300,6 +300,9 @@ class ShownVolume:
         sampled = map_coordinates(self._meant(values), at, order=1, mode="nearest")
         length = math.hypot((r1 - r0) * down, (c1 - c0) * across)
         return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(sampled).tolist()}
+
+    def _numbers(self, name: str) -> list[float]:
+        return list(np.asarray(self._parameters.get(name, ()), np.float64).tolist())
 
     def _at(self, time: int) -> VolumeSlices:
         """At one of the times; a volume that does not change is the same at all."""

@@ -17,10 +17,12 @@ from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
 from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.light import WARN, darks_beside_views, light_beside_flats
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.noise import NOISE_VIEWS, noise_level
+from recon.base.units import look_negative
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.voxels.view_weights import covers_the_circle
@@ -32,6 +34,7 @@ _HALF_A_PIXEL = 0.5  # doubles edges as far as the resolution, as for the monito
 _MOST_OF_THEM = 5, 95  # percent of views: one that a crumb crosses does not count
 _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
+_STEP_OF_LIGHT, _OF_OTHERS = 0.1, 12.0  # of line integral, as the monitor's alarm `gain`; times the usual step
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
@@ -41,8 +44,13 @@ _TURNED, _TURNED_SIGMAS = np.radians(4.0), 9.0  # of errors of angles along a sc
 _TURNED_LEFT = 0.95  # of the variance of moments: at angles that are wrong, others explain it; a tooth leaves 0.96
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral
+_FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
 _AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
 _SURE = 4.0  # standard deviations
+_INVERTED = (
+    "Where the sample is, the views are brighter than the air beside it, and line integrals are below 0: were images "
+    "stored with dark and bright exchanged, or of flats with another sample? Give them as the camera wrote them."
+)
 _EVEN, _STEP, _IN_TURN = 0.5, 0.8, -0.5  # shares that a line and a step explain of a change of mass; from view to view
 
 
@@ -80,11 +88,13 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     wide = geometry.is_off_middle and covers_the_circle(geometry.angles)
     whole = geometry.rows_show_slices and not geometry.shifts.any() and not wide
     few = len(data) < _LEAST_VIEWS or data.shape[1] < _LEAST_ROWS or selection.rows is not None
-    if not whole or few or prepared.measured is not None or prepared.emission is not None:
+    known = prepared.measured is None and prepared.emission is None and prepared.projections.floored <= _FLOORED
+    if not whole or few or not known:
         return {}
     some = _evenly(len(data), _VIEWS)
     if cut_sides(data, geometry) or _air_is_off(data, some):
-        return {}
+        laws = [_steady(data, some, prepared.projections.view_ids[some])]
+        return _told(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     noise = _mass_noise(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
@@ -95,6 +105,10 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         laws += [_angles(shown, geometry.angles)] if near else []
         laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
         laws += [_axis(shown, geometry.axis_col, selection)]
+    return _told(laws, warn)
+
+
+def _told(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
     for law in laws:
         if law.broken:
             warn(law.sentence)
@@ -125,8 +139,10 @@ def compare_with_flats(
         columns = [np.median(projections.data[view], axis=0) for view in _evenly(len(projections.data), _COLUMN_VIEWS)]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    found = light_beside_flats(source, groups, level, air, accepted or said or not refused)
-    for finding in (*darks_beside_views(source, groups, accepted or not refused), *found):
+    found = list(light_beside_flats(source, groups, level, air, accepted or said or not refused))
+    if air and look_negative(projections.data):
+        found.append(Finding("warning", "light", _INVERTED))
+    for finding in found:
         refuse(source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
@@ -152,6 +168,20 @@ def _mass_noise(prepared: PreparedProjections, views: Sequence[F32]) -> float:
     pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / air if air else 0.0)
     some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]  # that it reads: all together may not fit
     return noise_level(np.stack(some)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
+
+
+def _steady(data: F32, some: NDArray[np.intp], frames: NDArray[np.int64]) -> Law:
+    """The line integral of a whole view changes as little from one to the next as most, where no air tells of it."""
+    steps = np.diff([np.median(data[view]) for view in some])
+    at = int(np.abs(steps).argmax())
+    sentence = (
+        f"From frame {frames[at]} to frame {frames[at + 1]} the line integrals of the whole view change by "
+        f"{steps[at]:+.2f} at once (others by {np.median(np.abs(steps)):.2g}), and no air beside the sample corrects "
+        "it: light, exposure or filter changed, or views of another scan are among them. Choose views that belong "
+        "together with --views, or say which columns are air."
+    )
+    tolerance = max(_STEP_OF_LIGHT, _OF_OTHERS * float(np.median(np.abs(steps))))
+    return Law("steps of the light", float(abs(steps[at])), tolerance, "of line integral", sentence)
 
 
 def _upside_down(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:

@@ -232,7 +232,8 @@ class ScanFollower:
         """
         assert self._correction is not None and self._fit is not None
         fed = self._cursor.view_ids
-        frames = fed[np.isin(fed, usable.frames)]
+        kept = np.flatnonzero(np.isin(fed, usable.frames))
+        frames = fed[kept]
         gone = fed.size - frames.size
         shaded = self._correction.finds_shadow(frames)
         if not (gone or shaded or self._correction.outdated or self.source.part_starts.size > 1):
@@ -246,7 +247,7 @@ class ScanFollower:
         self._cursor = replace(self._cursor, batches=())  # not both in memory
         again = self._correction.at_once(frames)
         self._cursor = replace(self._cursor, batches=(again,))
-        self._fit.replace_views(again.data, self._angles(frames) if gone else None)
+        self._fit.replace_views(again.data, kept if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False if there is nothing to fit yet."""

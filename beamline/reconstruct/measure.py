@@ -21,7 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 
 _RESIDUAL_VIEWS = 16
 RESIDUAL_RAYS, _RESIDUAL_ROWS = 2**17, 16  # of a view; rows of a band: bands of rows stand for a large detector
@@ -157,10 +157,10 @@ def uniform_residual(grid: Grid, prepared: PreparedProjections) -> float:
         cylinder = np.broadcast_to(np.where(inside, np.float32(of), np.float32(0)), grid.shape)
         return _residual(Volume(cylinder, grid), data, prepared.geometry, some, weights, lambda done, count: None) ** 2
 
-    # The squares are 1 - 2 b c + a c² of the density c.
-    plus, minus = squares(density), squares(-density)
-    b, a = (minus - plus) / 4, (plus + minus) / 2 - 1
-    return math.sqrt(max(1 - b**2 / a, 0.0)) if a > 0 else 1.0
+    # The squares are q - 2 b c + a c² of the density c; q < 1, since views are compared at the resolution of voxels.
+    plus, minus, q = squares(density), squares(-density), squares(0.0)
+    b, a = (minus - plus) / 4, (plus + minus) / 2 - q
+    return math.sqrt(max(q - b**2 / a, 0.0)) if a > 0 else math.sqrt(q)
 
 
 def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
@@ -199,7 +199,7 @@ def squares_left(
     resolution: ViewResolution,
     measured: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """[view] squares of A x - p and of p, summed over the rays that were measured, p at the resolution of voxels.
+    """[view] squares of A x - G p, with the views at the resolution of voxels, and of p, over the rays measured.
 
     The data residual is the root of the sum of the first over that of the second, for every command that states one.
 
@@ -210,7 +210,7 @@ def squares_left(
     """
     known = np.isfinite(views) if measured is None else np.isfinite(views) & measured
     own = np.where(known, views, np.float32(0))
-    seen = as_voxels_see(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
+    seen = at_voxel_resolution(own.swapaxes(1, 2), resolution, known.swapaxes(1, 2)).swapaxes(1, 2)
     left = np.where(known, projected - seen, 0)
     sums = [np.square(each, dtype=np.float64).sum(axis=(1, 2)) for each in (left, own)]
     return sums[0], sums[1]
@@ -232,7 +232,7 @@ def _residual(
     """The residual of the volume in these views, without unmeasured rays."""
     squared = total = 0.0
     some = geometry.select(views)
-    matter = np.maximum(sum(data[view].sum(axis=1, dtype=np.float64) for view in views), 0)
+    matter = np.maximum(sum(np.nansum(data[view], axis=1, dtype=np.float64) for view in views), 0)
     bands = residual_bands(volume.grid, some, matter)
     for n, rows in enumerate(bands):
         part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)

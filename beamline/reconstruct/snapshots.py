@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
 from recon.prep.correct import Projections
-from recon.splatting.shown import BetterVolume
+from recon.splatting.shown import ShownVolume
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
@@ -109,7 +110,7 @@ class Snapshots:
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 
-    def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
+    def _method(self, shown: ShownVolume) -> tuple[str, dict[str, float]]:
         """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
         fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
@@ -135,10 +136,9 @@ def _why(errors: Mapping[str, float]) -> str:
     return f"which predicts views held out better (error of the volume along them: {each})"
 
 
-_GAP, _LINE = 14, 15  # pixels: between panels, a line of text
+_GAP, _LINE, _LETTER = 14, 15, 9  # pixels: between panels, a line of text, a letter of a heading at most
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
-_SIGMAS = 5.0  # range of the differences
-_COLOURS = ((31, 119, 180), (255, 255, 255), (214, 39, 40))  # of the least difference, none, the largest
+_SIGMAS, _MOST = 5.0, 99.0  # least range of the differences, and the percentile that it reaches: shapes stay seen
 _ORANGE = (255, 127, 14)
 _DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
 Wedge = tuple[float, float]
@@ -147,7 +147,7 @@ Wedge = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class PictureRow:
-    """Panels side by side, below a heading of one line; "": none."""
+    """Panels side by side, below a heading; "": none."""
 
     heading: str
     panels: Sequence[_Panel]
@@ -159,13 +159,15 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
 
     across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row.panels)) + _GAP
     tall = [max(panel.pixels.shape[0] for panel in row.panels) for row in rows]
-    headings = 2 * _LINE * sum(bool(row.heading) for row in rows)
-    size = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + headings + _GAP
+    headings = [wrap(row.heading, (3 * across - _GAP) // _LETTER) for row in rows]
+    above = sum((1 + len(lines)) * _LINE for lines in headings if lines)
+    size = 3 * across + _GAP, sum(tall) + len(rows) * (2 * _LINE + _GAP) + above + _GAP
     picture, top, file = Image.new("RGB", size, "white"), 0, io.BytesIO()
-    for row, pixels in zip(rows, tall, strict=True):
-        if row.heading:
-            ImageDraw.Draw(picture).text((_GAP, top + _LINE), row.heading, "black", _font(13, bold=True))
-            top += 2 * _LINE
+    for row, lines, pixels in zip(rows, headings, tall, strict=True):
+        for line in lines:
+            top += _LINE
+            ImageDraw.Draw(picture).text((_GAP, top), line, "black", _font(13, bold=True))
+        top += _LINE * bool(lines)
         for k, panel in enumerate(row.panels):
             panel.draw(picture, _GAP + k * across, top + _GAP)
         top += _GAP + 2 * _LINE + pixels
@@ -229,12 +231,13 @@ def _view_panels(view: F32, render: F32) -> list[_Panel]:
     noise = noise_level(view[None]) or 0.01 * (window[1] - window[0])
     difference = (view - render) / np.float32(noise)
     greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
-    spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
+    reach = max(_SIGMAS, float(np.percentile(np.abs(difference), _MOST)))
+    spread = f"black {-reach:.2g} to white {reach:.2g}; RMS {math.sqrt(float(np.mean(difference**2))):.2f}"
     (view, render, difference), _ = _sized((view, render, difference))
     return [
         _Panel(view, window, "newest view, u → z ↓", greys),
         _Panel(render, window, "the fit seen from there", "the same greys"),
-        _Panel(difference, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread, signed=True),
+        _Panel(difference, (-reach, reach), "difference in noise of a pixel", spread),
     ]
 
 
@@ -244,7 +247,7 @@ class _Panel:
 
     Attributes:
         pixels: of the screen [row, col].
-        limits: values that are black and white; of differences (`signed`) blue and red.
+        limits: values that are black and white.
         label, note: the two lines.
         bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
         unseen: for a dial of the rays in a slice across z that no view has taken yet; None: no dial.
@@ -255,7 +258,6 @@ class _Panel:
     label: str
     note: str
     bar: tuple[float, str] | None = None
-    signed: bool = False
     unseen: Wedge | None = None
 
     def draw(self, picture: Image, left: int, top: int) -> None:
@@ -267,9 +269,7 @@ class _Panel:
             draw.text((left, top + line * _LINE), text, colour, _font(11))
         top += 2 * _LINE
         shares = (self.pixels - self.limits[0]) / (self.limits[1] - self.limits[0])
-        ends = _COLOURS if self.signed else ((0,) * 3, (127.5,) * 3, (255,) * 3)
-        coloured = [np.interp(shares, (0, 0.5, 1), channel) for channel in zip(*ends, strict=True)]
-        picture.paste(Image.fromarray(np.stack(coloured, -1).astype(np.uint8)), (left, top))
+        picture.paste(Image.fromarray((255 * np.clip(shares, 0, 1)).astype(np.uint8)), (left, top))
         if self.bar is not None:
             pixel, unit = self.bar
             length = round_length(pixel * self.pixels.shape[1] / 3)  # a third of the image at most

@@ -54,7 +54,8 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
     """Ends of grey windows of a volume by their names, the first one first.
 
     "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen, "weak",
-    where it differs, to the least dense class, or where all matter is a pin of metal to the rest of the values. "all" holds all values but the last half per mille at each end.
+    where it differs, to the least dense class, or, where that is a pin of metal alone, to the rest of the values.
+    "all" holds all values but the last half per mille at each end.
     """
     classes = [each for each in class_levels(values) if each.size]
     if not classes:

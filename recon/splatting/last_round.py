@@ -1,4 +1,4 @@
-"""LastRound: how a fit whose views came one by one ends, as a method: a round over all views, and sweeps on voxels."""
+"""LastRound ends a streaming fit, as a method: a last round over all views, then sweeps on voxels."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def direct_volume(images: Sequence[F32], geometry: Geometry, grid: Grid) -> F32:
 
 
 @dataclass(frozen=True)
-class HeldOutErrors:
+class PredictionErrors:
     """The `volume_error` of the fit and of FBP, in views held out of a growing scan and as many others; NaN: not known.
 
     A volume's error is least at the angles of views and largest in the gaps. A view held out alone shows a gap that is
@@ -86,12 +86,12 @@ class HeldOutErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class BetterVolume:
+class ShownVolume:
     """The volume of the views so far that predicts views held out best, 1/mm. `direct`: it is FBP's, else the fit's."""
 
     volume: Volume
     direct: bool
-    errors: HeldOutErrors
+    errors: PredictionErrors
 
     @classmethod
     def of(
@@ -102,7 +102,7 @@ class BetterVolume:
         def render(view: int) -> F32:
             return problem.backend.numpy(next(renders(state, problem, settings, [view])))
 
-        errors = HeldOutErrors.of(problem.images, problem.geometry, held_out, render)
+        errors = PredictionErrors.of(problem.images, problem.geometry, held_out, render)
         if not errors.direct < errors.fit:
             return cls(volume_of(state, grid, problem.geometry, settings), False, errors)
         data = direct_volume(problem.images, problem.geometry, grid) * problem.scale

@@ -37,7 +37,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.splatting.shown import BetterVolume, HeldOutErrors
+from recon.splatting.shown import PredictionErrors, ShownVolume
 from recon.voxels.field_edges import wider_than_field
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
@@ -93,10 +93,11 @@ class StreamingFit:
         self._now, self._start = now, now()
         self._data: list[F32] = []
         self._angles: list[float] = []
+        self._held_out: list[bool] = []  # of each view; also where others before it are dropped
         self._unseen: list[int] = []  # views that no step has learnt, in the order they came
         self._problem: FitProblem | None = None
         self._state: fit.FitState | None = None
-        self._round_views, self._schedule_step, self._placed = 0, 0, 0
+        self._arrived, self._round_views, self._schedule_step, self._placed = 0, 0, 0, 0
         self.unlearnt = math.nan
         """||rendered - measured|| / ||measured|| of new views before a step has seen them, running mean."""
         self.step_seconds = 0.0
@@ -134,11 +135,12 @@ class StreamingFit:
             self._data.extend(images)
         else:
             self._problem = extend(self._problem, images, theta)
+        self._held_out += [arrivals.held_out(self._arrived + k) for k in range(theta.size)]
+        self._arrived += theta.size
         self._angles.extend(theta.tolist())
-        if self._state is not None:
-            self._unseen += [
-                view for view in range(self.n_views - theta.size, self.n_views) if not arrivals.held_out(view)
-            ]
+        if self._state is not None and theta.size:
+            new = range(self.n_views - theta.size, self.n_views)
+            self._unseen += [view for view in new if not self._held_out[view]]
             measured, rendered = self.newest_view()
             left = float(np.linalg.norm(measured - rendered) / max(float(np.linalg.norm(measured)), 1e-30))
             kept = self.unlearnt if math.isfinite(self.unlearnt) else left
@@ -156,25 +158,27 @@ class StreamingFit:
         (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
         return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
 
-    def replace_views(self, data: F32, angles: ArrayLike | None = None) -> None:
+    def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
         """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
 
-        The model stays and goes on. With `angles` [view] in radians only these views count from then on, and the rates
-        start again, because the model has learnt from bad views.
+        The model stays and goes on. With `kept`, the numbers of the views whose data these are, in order, only these
+        count from then on, and the rates start again, because the model has learnt from bad views.
 
         Raises:
             ValueError: where the shape is not that of the views, or values are not finite; nothing is changed.
         """
-        theta = np.asarray(self._angles if angles is None else angles, np.float64)
+        which = np.arange(self.n_views) if kept is None else np.asarray(kept, np.intp)
+        theta = np.asarray(self._angles)[which]
         if theta.size == 0:
             raise ValueError("there are no views to replace, or none would be left")
         images = arrivals.checked(data, theta, self._template.detector_shape)
-        self._angles = theta.tolist()
+        self._angles, self._held_out = theta.tolist(), [self._held_out[view] for view in which]
         if self._problem is None or self._state is None:
             self._data = list(images)
             return
         self._problem = with_projections(replace(self._problem, geometry=self._template.at(theta)), images)
-        if angles is not None:
+        if kept is not None:
+            self._round_views = min(self._round_views, self.n_views)
             self._state.drawn, self._state.mean, self._schedule_step = [], None, self._state.step
             self._unseen = []
 
@@ -235,9 +239,9 @@ class StreamingFit:
     def _next_view(self, state: fit.FitState) -> int | None:
         """The first view of the next step; None: any in turn, but for those held out, which the last round takes."""
         if len(state.drawn) < self._settings.views_per_step:
-            state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not arrivals.held_out(view)]
+            state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not self._held_out[view]]
         view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
-        return None if view is None or arrivals.held_out(view) else view
+        return None if view is None or self._held_out[view] else view
 
     @property
     def last_steps(self) -> int:
@@ -263,6 +267,7 @@ class StreamingFit:
         self._begin_round(force=True)
         state, problem = self._state, self._problem
         assert state is not None and problem is not None
+        self._unseen = []
         if state.mean is not None:  # from the better of the two
             state.parameters = {name: values + 0 for name, values in state.mean.items()}
         settled, first = replace(self._settings, policy=None), self._fraction()
@@ -286,12 +291,12 @@ class StreamingFit:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
         return fit.volume_of(averaged(self._state), self._grid, self._template, self._settings)
 
-    def shown(self) -> BetterVolume:
+    def shown(self) -> ShownVolume:
         """The volume that predicts views held out better: that of the model, or FBP of the views so far."""
         if self._problem is None or self._state is None:
-            return BetterVolume(self.snapshot(), False, HeldOutErrors())
-        apart = [view for view in range(self.n_views) if arrivals.held_out(view)]
-        return BetterVolume.of(averaged(self._state), self._problem, self._settings, self._grid, apart)
+            return ShownVolume(self.snapshot(), False, PredictionErrors())
+        apart = np.flatnonzero(self._held_out).tolist()
+        return ShownVolume.of(averaged(self._state), self._problem, self._settings, self._grid, apart)
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -315,7 +320,7 @@ class StreamingFit:
             if not force and (theta.size < self._first_views or arrivals.span(theta) < self._first_span):
                 return
             try:
-                self._place_first()
+                self._place_first(all_views=force)
             except ValueError:  # no matter in these views: wait for half as many again
                 if force:
                     raise
@@ -326,7 +331,7 @@ class StreamingFit:
             blind = max(float(image.max()) for image in self._problem.images) > _BLIND
             if blind or (not force and self.n_views < _YOUNG and self._state.step >= HALF):
                 self._data = list(self._problem.projections)
-                self._place_first(None if blind else self._state)
+                self._place_first(None if blind else self._state, all_views=force)
         assert self._state is not None
         # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
         most = round(self._placed * growth(self._settings))
@@ -334,27 +339,31 @@ class StreamingFit:
         self._round_views = self.n_views
         self._state.drawn = []  # draw from all views from now on
 
-    def _place_first(self, known: fit.FitState | None = None) -> None:
-        """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual."""
-        geometry = self._template.at(self._angles)
-        data = np.stack(self._data)
-        wider = wider_than_field(data, geometry)
+    def _place_first(self, known: fit.FitState | None = None, *, all_views: bool) -> None:
+        """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual.
+
+        Views held out have no part in it, unless `all_views` do.
+        """
+        every, data = self._template.at(self._angles), np.stack(self._data)
+        learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
+        geometry, seen = every.select(learnt), data[learnt]
+        wider = wider_than_field(data, every)
         field = Grid.for_fit(self._template, self._grid, wider=wider)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
         rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)
         count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
         if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
-            placed = place(data, geometry, rough, count, self._rng, kernel=kernel)
+            placed = place(seen, geometry, rough, count, self._rng, kernel=kernel)
         else:
             model = averaged(known)
-            rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, range(self.n_views))))
-            left = first_volume(data - rendered * self._problem.scale, geometry, rough)
+            rendered: F32 = np.stack(list(fit.renders(model, self._problem, self._settings, learnt)))
+            left = first_volume(seen - rendered * self._problem.scale, geometry, rough)
             volume = Volume(fit.volume_of(model, rough, self._template, self._settings).data + left.data, rough)
             radius = math.inf if wider else geometry.reach
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
-            placed = scale_to_data(placed, data, geometry)
-        self._problem = fit.problem_of(data, geometry, field, placed.density_unit, self._settings)
+            placed = scale_to_data(placed, seen, geometry)
+        self._problem = fit.problem_of(data, every, field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data, self._unseen = [], []  # the problem holds them from now on

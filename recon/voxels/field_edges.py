@@ -48,6 +48,7 @@ class FieldEdges:
             return cls({}, 0.0)
         views = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))
         some = data[np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))]
+        some = np.where(np.isfinite(some), some, np.nan)
         mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
         some = some[:, mass >= _FULL * mass.max()]
         edges = {"left": some[..., :width], "right": some[..., -width:]}

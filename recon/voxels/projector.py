@@ -4,9 +4,9 @@ Both directions run on lines along z: volumes [y, x, z], projections [view, col,
 that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
 and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
-Without `Geometry.width` a ray has no width. With it, a pixel takes from its neighbours, with the variance
-of its square and its blur. A view is then the mean of views at angles within its arc. Both are linear and transposed
-exactly. Pixels should not be much larger than voxels, or voxels between the rays are not seen.
+A projection has the resolution of the views, see `ViewResolution`: of pixels one pitch wide, or of `Geometry.width`.
+With an arc, a view is the mean of views at angles within it. Both are linear and transposed exactly. Pixels should not
+be much larger than voxels, or voxels between the rays are not seen.
 
 With `Geometry.skew`, bands of slices are seen at the angles of their rows.
 """
@@ -303,8 +303,9 @@ def residual_norms(
     if projections.shape != expected:
         raise ValueError(f"projections have shape {projections.shape}, their geometry says {expected}")
     root = np.float32(1) if weights is None else np.sqrt(weights)
-    left = float(np.linalg.norm(root * (project(volume, geometry) - projections)))
-    return left, float(np.linalg.norm(root * projections))
+    known = projections if weights is None else np.where(weights > 0, projections, np.float32(0))
+    left = float(np.linalg.norm(root * (project(volume, geometry) - known)))
+    return left, float(np.linalg.norm(root * known))
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""At what resolution views and voxels are compared: how much blurrier voxels are, and who makes up for it.
+"""How much blurrier projections of voxels are than measured views, and where that is corrected.
 
 A pixel of a view is the mean of line integrals over its area, of variance p²/12 along columns and along rows. A voxel
 of a volume is the mean of the object over its edges h, of variance h²/12 along every direction. Its projection by
@@ -23,9 +23,12 @@ from recon.base.arrays import F32, F64
 from recon.base.empirical import SHARPENED
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.kernels.cpu.spread import spread
+from recon.kernels.cpu.spread import passes_of, spread
 
-_MOST = 1 / 6  # px² of excess that voxels as wide as pixels have; what coarser ones have beyond it, views lose
+_MOST = (
+    1 / 6
+)  # px² of excess that sharpening corrects, as voxels as wide as pixels have; views are smoothed by the rest
+_ALL = 1 / 6  # of an edge squared: variance of interpolation at all distances, on average
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _NOTHING = 1e-9  # px²: rounding
 _STILL = 0.1  # voxels: rays that drift by less within the box meet all planes alike
@@ -39,17 +42,17 @@ class ViewResolution:
 
     Attributes:
         voxels: [view, 2, 3], edges of a voxel along the axes (x, y, z), in px as seen along columns and rows.
-        interpolation: [view, 3], variance along these axes of a ray's interpolation, in squares of an edge. It is that
-            of all distances, but for a parallel beam along the planes' normal, whose rays keep theirs.
+        interpolation: [view, 3], variance along these axes of a ray's interpolation, in squares of an edge: 1/6, the
+            mean over all distances d, but for a parallel view along a grid axis, where all rays have one: d (1 - d).
         views: variance of a pixel in px², and of the detector's blur.
-        of_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are not:
-            a slab would depend on the rows beside it, and views that lean a little on how much.
+        sharpens_rows: rows of a cone, which all interpolate between slices, are sharpened. Those of a parallel beam are
+            not: a slab would depend on the rows beside it, and views that lean a little on how much.
     """
 
     voxels: F64
     interpolation: F64
     views: tuple[float, float]
-    of_rows: bool
+    sharpens_rows: bool
 
     @classmethod
     def of(cls, geometry: Geometry, grid: Grid) -> ViewResolution:
@@ -78,23 +81,32 @@ class ViewResolution:
 
     @property
     def sharpened(self) -> F64:
-        """[view, 2] px², that the model takes off its projections; negative: that it adds to them."""
-        most = np.array([_MOST, _MOST if self.of_rows else 0.0])
+        """[view, 2] px² of variance that the model takes off its projections; negative: that it adds to them."""
+        most = self._most[:, None] * (1.0, float(self.sharpens_rows))
         return np.minimum(np.where(self.excess > 0, SHARPENED * self.excess, self.excess), most)
 
     @property
+    def _most(self) -> F64:
+        """[view] px² of excess of voxels as wide as pixels."""
+        return np.maximum(self.interpolation.max(1), _MOST)
+
+    @property
     def smoothed(self) -> F64:
-        """[view, 2] px², that is added to the views, since voxels are too coarse for their edges."""
-        beyond = self.excess - _MOST
+        """[view, 2] px² of variance added to the views, whose edges are sharper than coarse voxels can show."""
+        beyond = self.excess - self._most[:, None]
         return np.where(beyond > _NOTHING, beyond, 0.0)
 
     def transfer(self, axis: int, f: F64) -> F64:
         """[view, frequency] what a projection by the model keeps of a view at f cycles a pixel."""
-        at = np.sinc(self.voxels[:, axis, :, None] * f)
-        share = at.prod(1) * (np.abs(at) ** (12 * self.interpolation[..., None])).prod(1)  # a triangle's is sinc²
+        edges, variance = self.voxels[:, axis, :, None] * f, self.interpolation[..., None]
+        at = np.sinc(edges)
+        d = (1 - np.sqrt(np.maximum(1 - 4 * variance, 0))) / 2
+        of_two = (1 - d) * np.cos(2 * np.pi * edges * d) + d * np.cos(2 * np.pi * edges * (1 - d))  # in phase
+        share = at.prod(1) * np.where(variance == _ALL, at**2, of_two).prod(1)  # a triangle's is sinc²
         pixel, blur = self.views
         seen = np.sinc(np.sqrt(12 * pixel) * f) * np.exp(-2 * np.pi**2 * blur * f**2)
-        model = 1 + self.sharpened[:, axis, None] * (1 - np.cos(2 * np.pi * f))
+        passes = max(passes_of(self.sharpened), 1)
+        model = (1 + self.sharpened[:, axis, None] / passes * (1 - np.cos(2 * np.pi * f))) ** passes
         return np.clip(np.divide(share * model, seen, out=np.ones_like(share), where=seen > share * model), 0, 1)
 
 
@@ -120,7 +132,7 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     run = np.abs(beam)
     across = np.where(run[:, 1] >= run[:, 0], 1, 0)  # the planes that sample a ray
     across = np.where(run[:, 2] > run[:, :2].max(1), 2, across)
-    found = np.where(across[:, None] != np.arange(3), 1 / 6, 0.0)
+    found = np.where(across[:, None] != np.arange(3), _ALL, 0.0)
     if geometry.is_cone:
         return found
     edges, first, count = (np.array(each[::-1]) for each in (grid.spacing, grid.first, grid.shape))
@@ -140,7 +152,7 @@ def _interpolation(geometry: Geometry, grid: Grid, axes: F64) -> F64:
     return np.where(still & (found > 0), np.round(d * (1 - d), _DIGITS), found)
 
 
-def as_voxels_see(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
+def at_voxel_resolution(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
     """Views [view, col, row] at the resolution of projections of a volume by the model; only rays that count have part.
 
     A ray that does not count, or has few beside it that do, keeps its value.
@@ -173,7 +185,7 @@ def _filtered(views: F32, filters: list[F64]) -> F32:
 
 
 def smoothed(views: F32, resolution: ViewResolution, counts: NDArray[np.bool_] | None = None) -> F32:
-    """Views [view, col, row] without what voxels are too coarse for; the same array where they are not.
+    """Views [view, col, row], low-pass filtered to the resolution of coarse voxels; the same array for fine ones.
 
     Rays that do not count have no part.
     """

@@ -15,7 +15,7 @@ from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
-from recon.voxels.resolution import as_voxels_see
+from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.view_weights import seen_by
 
 LIMIT = 0.007
@@ -89,7 +89,7 @@ def unexplained(
     if weights is not None:
         unseen = unseen | (weights[:, rows] == 0)
     lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, as the model is
-    left = as_voxels_see(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
     left = left - projector.forward(part.data)
     left[unseen] = 0
     left -= ring_offsets(left, views.axis_col)

@@ -52,7 +52,7 @@ class VoxelProblem:
 
     @property
     def norm(self) -> float:
-        """`largest_eigenvalue` of all views, computed once for all copies of the problem with their projector."""
+        """`largest_eigenvalue` of AᵀWA, computed once for all copies of the problem with this projector and weight."""
         for projector, weight, norm in self._norms:
             if projector is self.projector and weight is self.weight:
                 return norm

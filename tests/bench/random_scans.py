@@ -56,9 +56,9 @@ class RandomScan:
 def random_scan(seed: int) -> RandomScan:
     """Size, noise, sample, effects, order and turn are random."""
     rng = np.random.default_rng(seed)
-    shape = int(rng.integers(8, 48)), int(rng.integers(56, 144))
+    shape = int(rng.integers(8, 28)), int(rng.integers(56, 112))
     wide = bool(rng.random() < 0.15)
-    views = int(rng.integers(60, 200))
+    views = int(rng.integers(60, 140))
     turn = float(rng.choice([180.0, 360.0])) * float(rng.choice([1, -1], p=[0.8, 0.2]))
     photons = float(10 ** rng.uniform(2.6, 3.75))
     about = {"shape": shape, "views": views, "turn": turn, "photons": photons, "wide": wide}
@@ -148,7 +148,7 @@ def _effects(rng: np.random.Generator, about: dict[str, Any], steady: bool) -> l
     some = [
         ("runout", {"kind": "runout", "radial_random_um": PITCH * 0.1}),
         ("hard", {"kind": "beam_hardening", "weights": [1, 1, 1], "ratios": [0.8, 1.0, 1.25]}),
-        ("profile", {"kind": "beam_profile", "sigma": [1.6, 0.8], "stripes": 0.03, "stripe_period": 0.09, "drift": 2.0e-5}),
+        ("profile", {"kind": "beam_profile", "sigma": [1.6, 0.8], "stripes": 0.03, "drift": 2.0e-5}),
         ("ring", {"kind": "ring_current", "lifetime": float(rng.uniform(100, 2000))}),
         ("prnu", {"kind": "prnu", "spread": 0.03}),
         ("noise", "photon_noise"),
@@ -161,7 +161,7 @@ def _effects(rng: np.random.Generator, about: dict[str, Any], steady: bool) -> l
     chosen = [
         each
         for each in some
-        if each[0] == "noise" or (rng.random() < 0.35 and not (steady and each[0] in ("ring", "profile")))
+        if each[0] == "noise" or (rng.random() < 0.35 and not (steady and each[0] in ("ring", "profile", "dead")))
     ]
     about["effects"] = [name for name, _ in chosen]
     return [*(effect for _, effect in chosen), "offset"]
@@ -204,7 +204,8 @@ def written(scan: RandomScan, layout: str, folder: Path, rng: np.random.Generato
     if layout == "stacks":
         for name, images in (("dark", dark), ("flat", flat), ("sample", view)):
             tifffile.imwrite(folder / f"{name}.tif", images, photometric="minisblack")
-        return ["sample.tif", "--angles", "angles.txt", "--darks", "dark.tif", "--flats", "flat.tif", "--pixel-size-um", str(PITCH)]  # fmt: skip
+        references = ["--darks", "dark.tif", "--flats", "flat.tif"]
+        return ["sample.tif", "--angles", "angles.txt", *references, "--pixel-size-um", str(PITCH)]
     light = np.maximum(flat.mean(axis=0) - dark.mean(axis=0), 1.0)
     through = np.maximum((view - dark.mean(axis=0)) / light, 1e-4).astype(np.float32)
     logarithm = bool(rng.random() < 0.5)

@@ -264,7 +264,8 @@ class NXtomoSource(ScanSource):
     @property
     def flags(self) -> FrameFlags | None:
         with hdf5.readable(self.path):
-            return read_flags(self._file, self.n) if self._ours else None
+            flags = read_flags(self._file, self.n) if self._ours else None
+        return flags if flags is not None and (self.plan or flags.flagged.any()) else None  # a copy has none to say
 
     @property
     def currents(self) -> NDArray[np.float64] | None:

@@ -14,7 +14,14 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.no_data import counts_photons
 from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure, views_differ
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.references import ReferenceGroups, exposures_of, reference_frame, some_of
+from beamline.storage.rules.references import (
+    ReferenceGroups,
+    exposures_of,
+    groups_taken,
+    reference_frame,
+    reference_groups,
+    some_of,
+)
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
 
@@ -103,13 +110,17 @@ def light_beside_flats(
         )
 
 
-def darks_beside_views(source: ScanSource, groups: ReferenceGroups, accepted: bool = False) -> Iterator[Finding]:
+def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
     """Darks are images, and no place of the views has fewer counts: light only adds.
 
     Args:
-        groups: the references that are used.
-        accepted: a fault is a warning.
+        accepted: all are used as they are, so that a fault is a warning.
     """
+    if source.quantity != "counts":
+        return
+    groups = groups_taken(source) if accepted else reference_groups(source).good()
+    if not (groups.darks and groups.flats):
+        return
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = _mean(source, of_darks), _mean(source, of_flats)
     if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
@@ -129,9 +140,9 @@ def darks_beside_views(source: ScanSource, groups: ReferenceGroups, accepted: bo
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
-            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the {light:.4g} "
-            "of light in the flats), though light only adds: the darks are too high. Were they taken with light, with "
-            "another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
+            f"In places the views have {max(deep):.3g} counts less than the darks (limit {limit:.3g}, by the "
+            f"{light:.4g} of light in the flats), though light only adds: the darks are too high. Were they taken with "
+            "light, with another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
         )
         sentence += "" if accepted else " --references accept uses these."
         yield Finding("warning" if accepted else "error", "light", sentence)
@@ -235,8 +246,9 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
         doubt = f"taken for {usual:g} s" + (
             "."
             if known
-            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, by which no "
-            "view is brighter than they: where the sample fills the field, all line integrals may be off by one amount."
+            else f", the flats, whose exposure is not stated, for {np.nan_to_num(taken, nan=usual).max():g} s, so that "
+            "no view is brighter than they: where the sample fills the field, all line integrals may be off by one "
+            "amount."
         )
         yield Finding(
             "info" if known else "warning",

@@ -34,13 +34,18 @@ def _pass(lines: F32, shares: F32, out: F32) -> None:
             up, middle = middle, down
 
 
+def passes_of(*variances: NDArray[np.float64]) -> int:
+    """Passes that `spread` makes for these variances; each keeps 1 - variance / passes (1 - cos 2πf) at f."""
+    return math.ceil(max(float(np.abs(each).max()) for each in variances) / _MOST)
+
+
 def spread(lines: F32, along_cols: NDArray[np.float64], along_rows: NDArray[np.float64]) -> F32:
     """The lines [view, col, row] after passes of three neighbours each, of these variances [view] in px².
 
     A variance below zero takes so much away: views become sharper, by 1 - variance (1 - cos 2πf) at f cycles a pixel.
     A pixel at the edge takes from itself what lies beyond. The matrix is symmetric.
     """
-    passes = math.ceil(float(max(np.abs(along_cols).max(), np.abs(along_rows).max())) / _MOST)
+    passes = passes_of(along_cols, along_rows)
     if passes == 0:
         return lines
     shares = np.empty((len(lines), 2), np.float32)

@@ -17,7 +17,7 @@ from recon.assess.metrics import ssim_of_whole_slices
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from tests.beamline.prepared_views import prepared_views
 
 DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
@@ -81,7 +81,7 @@ def _views_and_as_seen(prepared: PreparedProjections, grid: Grid) -> tuple[np.nd
     """Sixteen of the twenty views, which are compared, and these at the resolution of voxels."""
     some = np.unique(np.linspace(0, 19, 16).round().astype(int))
     views = prepared.projections.data[some].swapaxes(1, 2)
-    return views, as_voxels_see(views, ViewResolution.of(prepared.geometry.select(some), grid))
+    return views, at_voxel_resolution(views, ViewResolution.of(prepared.geometry.select(some), grid))
 
 
 def _ball() -> Volume:

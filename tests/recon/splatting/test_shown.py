@@ -13,7 +13,7 @@ from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.splatting import optimise
 from recon.splatting.last_round import LastRound
 from recon.splatting.r2 import R2
-from recon.splatting.shown import HeldOutErrors, direct_volume, volume_error
+from recon.splatting.shown import PredictionErrors, direct_volume, volume_error
 from recon.splatting.stream import StreamingFit
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
@@ -86,7 +86,7 @@ def test_views_that_fbp_does_not_take_are_not_compared() -> None:
     cone = Geometry.cone([0.0, 1.0, 2.0], SHAPE, pixel_pitch=PITCH, sod=50.0, sdd=100.0)
     view = np.ones(SHAPE, np.float32)
     for geometry, held_out in ((cone, [1]), (VIEWS.select(range(3)), [])):
-        errors = HeldOutErrors.of([view] * 3, geometry, held_out, lambda number: view)
+        errors = PredictionErrors.of([view] * 3, geometry, held_out, lambda number: view)
         assert np.isnan(errors.fit) and np.isnan(errors.direct)
 
 

@@ -159,10 +159,10 @@ def test_a_view_that_has_come_is_learnt_by_the_next_step(data: np.ndarray, monke
     model.advance(0.2)
     assert taken[:4] == [20, 21, 22, 23]
     taken.clear()
-    model.replace_views(data[:12], ANGLES[:12])  # of others, some of which no step had learnt
-    model.add_views(data[12:13], ANGLES[12:13])
+    model.replace_views(data[:12], np.arange(12))  # some of the others no step had learnt
+    model.add_views(data[12:14], ANGLES[12:14])  # the first of them is the 24th that came, and judges
     model.advance(0.1)
-    assert taken[0] == 12
+    assert taken[0] == 13
 
 
 def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import ViewResolution, as_voxels_see, smoothed
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution, smoothed
 from recon.voxels.voxel_problem import largest_eigenvalue
 
 SIDE, WIDTH = 192, 24.0
@@ -34,7 +34,7 @@ def _response(geometry: Geometry, grid: Grid, f: float, matched: bool) -> float:
     found = Projector(geometry, grid, matched).forward(_wave(grid, geometry.axes(0)[0], f))[0, 0]
     u = (np.arange(found.size) - geometry.axis_col) * geometry.pixel_pitch
     exact = np.sqrt(2 * np.pi) * WIDTH * np.exp(-(u**2) / (2 * WIDTH**2)) * np.cos(2 * np.pi * f * u)
-    exact *= np.sinc(f * geometry.pixel_pitch)
+    exact *= np.sinc(f * geometry.pixel_pitch) * np.exp(-2 * (np.pi * geometry.width.blur * f) ** 2)
     return float(found @ exact / (exact @ exact))
 
 
@@ -48,6 +48,25 @@ def test_a_plane_wave_loses_what_the_transfer_says(degrees: float, voxel: float)
     for f in (0.05, 0.125, 0.25):
         expected = ViewResolution.of(geometry, grid).transfer(0, np.array([f]))[0, 0]
         assert _response(geometry, grid, f, True) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("off", [0.5, 0.3])
+def test_a_view_along_an_axis_keeps_what_two_voxels_do(off: float) -> None:
+    geometry = replace(Geometry.parallel([0.0], (1, SIDE)), axis_col=(SIDE - 1) / 2 + off)
+    grid = Grid((1, SIDE, SIDE))
+    resolution = ViewResolution.of(geometry, grid)
+    assert not resolution.smoothed.any()
+    for f in (0.05, 0.125, 0.25, 0.375):
+        expected = resolution.transfer(0, np.array([f]))[0, 0]
+        assert _response(geometry, grid, f, True) == pytest.approx(expected, abs=0.01)
+
+
+def test_a_wide_blur_of_the_detector_is_spread_in_passes() -> None:
+    geometry = Geometry.parallel([math.radians(20.0)], (1, SIDE)).seen_with(RayWidth(pixel=1, blur=1.0))
+    grid = Grid((1, SIDE, SIDE))
+    for f in (0.05, 0.125, 0.2):
+        expected = ViewResolution.of(geometry, grid).transfer(0, np.array([f]))[0, 0]
+        assert min(_response(geometry, grid, f, True), 1) == pytest.approx(expected, abs=0.02)
 
 
 def test_sharpening_brings_views_nearer_to_those_that_are_measured() -> None:
@@ -172,9 +191,9 @@ def test_rays_that_do_not_count_have_no_part(rng: np.random.Generator) -> None:
     resolution = ViewResolution.of(geometry, Grid((14, 17, 17), 1.4))
     views, counts = np.ones((3, 24, 20), np.float32), rng.random((3, 24, 20)) > 0.1
     views[~counts] = 1e6
-    for found in (as_voxels_see(views, resolution, counts), smoothed(views, resolution, counts)):
+    for found in (at_voxel_resolution(views, resolution, counts), smoothed(views, resolution, counts)):
         np.testing.assert_allclose(found[counts], 1, rtol=1e-5)
-    plain = as_voxels_see(np.ones_like(views), resolution)
+    plain = at_voxel_resolution(np.ones_like(views), resolution)
     np.testing.assert_allclose(plain, 1, rtol=1e-6)
 
 

@@ -75,7 +75,7 @@ const timeline = new Timeline($("flags"), { go });
 async function fetchFlags() {
   flags = await (await fetch("api/flags")).json();
   const marked = new Set(flags.map((flag) => flag.frame)).size;
-  $("flag-count").textContent = `${marked} of ${frames} frames`;
+  $("flag-count").textContent = facts.monitored || marked ? `${marked} of ${frames} frames` : "";
   nameFrame();
   frame.redraw();
 }
@@ -163,7 +163,7 @@ async function fetchVolume() {
     $(`at${axis}`).max = volume.shape[axis] - 1;
     if (changed) $(`at${axis}`).value = Math.floor(volume.shape[axis] / 2);
   }
-  $("viewer-link").hidden = false;
+  $("volume").hidden = $("viewer-link").hidden = false;
   windowButtons($("volume-window"), volume.windows, (window) => { chosenWindow = window !== volume.window; setWindowOf(window); });
   if (!chosenWindow) setWindowOf(volume.window);
   await Promise.all([0, 1, 2].map(showSlice));
@@ -304,6 +304,7 @@ async function begin() {
   facts = await (await fetch("api/facts")).json();
   document.title = `${facts.sample} - splatline`;
   $("run").textContent = facts.run;
+  timeline.monitored = facts.monitored;
   $("sinogram-row").max = facts.shape[0] - 1; $("sinogram-row").value = Math.floor(facts.shape[0] / 2);
   $("verbs").hidden = !(facts.may_act && act);
 }

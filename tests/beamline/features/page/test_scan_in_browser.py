@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.beamline.features.page.chromium import BEAMLINE, MARKS, Browser, browser, canvas_has_picture, page_of
-from tests.beamline.page.test_shown_scan import FORMATS
+from tests.beamline.features.page.test_shown_scan import FORMATS
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 __all__ = ["browser"]

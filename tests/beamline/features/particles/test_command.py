@@ -213,7 +213,7 @@ def test_napari_gets_the_volume_and_its_labels(here: Path, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("undrawn")
 def test_the_first_line_says_whether_the_table_is_of_use(here: Path) -> None:
-    """A pin of metal does not stand for the sample, and a square that cuts most bodies gives way to the whole volume."""
+    """A pin of metal does not stand for the sample; a square that cuts most bodies gives way to the whole volume."""
     z, y, x = np.mgrid[:30, :80, :80] - np.array([14.5, 39.5, 39.5])[:, None, None, None]
     data = np.where(y**2 + x**2 < 30**2, np.float32(0.1), np.float32(0))
     data[(y**2 + x**2 < 5**2) & (np.abs(z) < 9)] = 4

@@ -20,7 +20,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
-from recon.voxels.resolution import ViewResolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -47,7 +47,7 @@ def test_the_score_is_what_a_volume_leaves_of_views_that_it_has_not_seen(folder:
         views = geometry.select(used)
         volume = direct(lines[used], views, Grid.matching(views), name)  # type: ignore[arg-type]
         projector = Projector(geometry.select(held), Grid.matching(views))
-        seen = as_voxels_see(lines[held].swapaxes(1, 2), projector.resolution).swapaxes(1, 2)
+        seen = at_voxel_resolution(lines[held].swapaxes(1, 2), projector.resolution).swapaxes(1, 2)
         off = projector.forward(volume) - seen
         expected[name] = np.linalg.norm(off) / np.linalg.norm(lines[held])
     table = {row["filter"]: float(row["residual_held_out"]) for row in _table()}

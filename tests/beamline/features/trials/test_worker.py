@@ -25,7 +25,7 @@ from recon.base.volume import Grid, Volume
 from recon.methods import by_name, names_of_one_volume, taking
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution, as_voxels_see
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
@@ -85,7 +85,7 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
     volume = Volume(expected, Grid.matching(data.geometry))
     unseen, geometry = data.prepared.held_out
     resolution = ViewResolution.of(geometry, volume.grid)
-    seen = as_voxels_see(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
+    seen = at_voxel_resolution(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
     left = np.linalg.norm(project(volume, geometry) - seen) / np.linalg.norm(unseen)
     assert found["metrics"]["residual_held_out"] == pytest.approx(left, rel=1e-6)
     assert 2 * 0.5 <= found["metrics"]["resolution"] < 12  # between two voxels and the inner cylinder's size

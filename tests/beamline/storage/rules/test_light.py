@@ -30,14 +30,17 @@ def counts(radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return darks, flats, views
 
 
-def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray) -> str:
+def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray, exposures: np.ndarray | None = None) -> str:
     """All sentences of a scan, or of its refusal."""
     frames = np.concatenate([np.clip(np.round(each), 0, 65535).astype(np.uint16) for each in (darks, flats, views)])
     keys = [2] * len(darks) + [1] * len(flats) + [0] * len(views)
     angles = np.concatenate([np.full(len(darks) + len(flats), np.nan), ANGLES])
     sentences: list[str] = []
+    source = ArraySource(frames, keys, angles)
+    if exposures is not None:
+        source.exposures = exposures
     try:
-        prepare_projections(ArraySource(frames, keys, angles), Selection(axis_col=31.5), sentences.append)  # type: ignore[arg-type]
+        prepare_projections(source, Selection(axis_col=31.5), sentences.append)  # type: ignore[arg-type]
     except DataError as error:
         return f"refused: {error}"
     return " ".join(sentences)
@@ -79,6 +82,52 @@ def test_an_offset_of_signed_numbers() -> None:
 def test_multiplied_flats_of_a_sample_that_fills_the_field_have_another_noise() -> None:
     darks, flats, views = counts(60.0)
     assert "times the noise of the views" in told(darks, 100 + (flats - 100) * 10, views)
+    assert "times the noise of the views" in told(2 * darks, 2 * flats, views)
+
+
+def test_darks_above_the_views() -> None:
+    darks, flats, views = counts(60.0)
+    said = told(darks + 1800, flats, views)
+    assert said.startswith("refused: ")
+    assert "counts less than the darks" in said
+
+
+def test_darks_of_zeros_beside_the_flats_of_a_camera_and_of_a_counter_of_photons() -> None:
+    darks, flats, views = counts(20.0)
+    assert "All darks are 0" in told(0 * darks, flats + 900, views + 900)
+    assert "All darks are 0" not in told(0 * darks, flats - 100, views - 100)
+
+
+def test_flats_that_end_at_one_count_everywhere() -> None:
+    darks, flats, views = counts(20.0)
+    darks = darks + np.random.default_rng(0).normal(0, 3, darks.shape)
+    assert "every pixel of them holds 2500, though" in told(darks, np.minimum(flats, 2500), np.minimum(views, 2500))
+
+
+def test_a_step_of_the_light_where_the_sample_fills_the_field() -> None:
+    darks, flats, views = counts(60.0)
+    views[20:] = (views[20:] - 100) * 0.7 + 100
+    assert "From frame 29 to frame 30 the line integrals of the whole view change by +0.36 at once" in told(
+        darks, flats, views
+    )
+
+
+def test_images_with_dark_and_bright_exchanged() -> None:
+    darks, flats, _ = counts(20.0)
+    light = 100 + LIGHT * (1.6 - np.exp(-lines(20.0)))
+    assert "brighter than the air beside it" in told(darks, flats, light)
+
+
+@pytest.mark.parametrize("of_flats", [0.1, 0.3])
+def test_flats_without_a_stated_exposure_beside_views_of_several(of_flats: float) -> None:
+    """The longest of the views' by which no view is brighter than the flats."""
+    darks, flats, views = counts(60.0)
+    seconds = np.where(np.arange(len(views)) % 2, 0.1, 0.3)
+    views = (views - 100) * seconds[:, None, None] / of_flats + 100
+    exposures = np.concatenate([np.full(len(darks) + len(flats), np.nan), seconds])
+    said = told(darks, flats, views, exposures)
+    assert f"the flats, whose exposure is not stated, for {of_flats:g} s" in said
+    assert "as the flats" not in said
 
 
 @pytest.mark.parametrize("level", [1 - 0.9 * (1 - np.exp(-WARN)), np.exp(0.9 * BRIGHTER)])
