@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import block_means, check_block, digest
+from beamline.monitor.digest import block_means, check_block, is_valid
 from beamline.monitor.flats_with_sample import (
     brighter_in_places,
     flats_like_views,
@@ -278,22 +278,17 @@ def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:
 
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     """Statistics of an image, with its cells."""
-    saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    block = check_block(image.shape)
-    side = max(1, image.shape[1] // CELLS)
-    about = row, FrameKind.INVALID, np.nan
-    if image.dtype == np.uint16:
-        saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-        frame = ReferenceFrame.seen(*about, saturated, block_means(image, block), block)
-        held = np.bincount(image.ravel())
-        end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else int(image.max())
-        beside = BY_CHANCE if end == held.size - 1 else max(BY_CHANCE, int(held[end - 1]))
-        shared = (
-            max(0, int(held[end]) - beside) / image.size
-        )  # counts that thin out towards a few hot pixels do not end
-        return replace(frame, cells=block_means(image, side), largest=float(end), at_largest=shared)
-    known = digest(image, saturation, block)
-    frame = ReferenceFrame.of(*about, known, block)
-    cells = digest(image, None, side).preview
-    frame = replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
-    return frame if image.dtype.kind in "ui" else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0
+    counts = image.dtype.kind in "ui"
+    saturation = full_scale(float(image.max())) if counts else None
+    saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
+    block, side = check_block(image.shape), max(1, image.shape[1] // CELLS)
+    frame = ReferenceFrame.seen(row, FrameKind.INVALID, np.nan, saturated, block_means(image, block), block)
+    frame = replace(frame, cells=block_means(image, side))
+    if image.dtype != np.uint16:
+        frame = replace(frame, invalid=1 - float(np.mean(is_valid(image))))
+        return frame if counts else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0
+    held = np.bincount(image.ravel())
+    end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else int(image.max())
+    beside = BY_CHANCE if end == held.size - 1 else max(BY_CHANCE, int(held[end - 1]))
+    shared = max(0, int(held[end]) - beside) / image.size  # counts that thin out towards a few hot pixels do not end
+    return replace(frame, largest=float(end), at_largest=shared)
