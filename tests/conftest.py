@@ -21,7 +21,7 @@ from recon.compiled import ROOT  # before numba: it says what processor numba co
 # isort: split
 import numba
 
-from recon.compiled.archive import archive_of, fresh_members, read_sources
+from recon.compiled.archive import ARCHIVE, PYTHONS, fresh_members, read_sources
 from recon.compiled.level import LEVELS, level_for, processor_flags
 from tests.features import folders, table
 
@@ -92,10 +92,13 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 def _kernels_are_carried() -> bool:
     """All of these sources, compiled for this processor: nothing is left to compile."""
-    archive = archive_of(sys.version_info[:2])
-    if not archive.is_file() or level_for(os.environ, processor_flags()) not in LEVELS:
+    if (
+        not ARCHIVE.is_file()
+        or sys.version_info[:2] not in PYTHONS
+        or level_for(os.environ, processor_flags()) not in LEVELS
+    ):
         return False
-    return set(read_sources(archive)) == set(fresh_members(archive, ROOT))
+    return set(read_sources(ARCHIVE)) == set(fresh_members(ARCHIVE, ROOT))
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

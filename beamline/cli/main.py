@@ -7,6 +7,7 @@ import io
 import os
 import sys
 import warnings
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -15,7 +16,7 @@ import click
 from click.exceptions import Abort, ClickException, Exit
 from click.shell_completion import CompletionItem
 
-from beamline.cli.commands import CORE, CommandEntry, commands, own_commands
+from beamline.cli.commands import CORE, CommandEntry, Libraries, commands, own_commands
 from beamline.core.errors import (
     INTERRUPTED,
     BeamlineError,
@@ -31,6 +32,8 @@ from recon.base.registry import did_you_mean
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
 """Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
+
+_QUIET = {"-h", "--help", "--help-all", "--json"}
 
 
 class _Lasting(io.FileIO):
@@ -209,6 +212,14 @@ def main(debug: bool) -> None:
         )
 
 
+def _say_begun(words: Sequence[str]) -> None:
+    """A first line of commands whose libraries take seconds to load, from a cold disk many."""
+    name = next((word for word in words if not word.startswith("-")), "")
+    command = own_commands().get(name)
+    if command is not None and command.libraries in (Libraries.FRAMES, Libraries.FITS) and not _QUIET & {*words}:
+        click.echo(f"{name}: loading libraries", err=True)
+
+
 def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
@@ -218,6 +229,7 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {printable(str(message))}", err=True)
     outputs, code = Outputs(), 0
+    _say_begun(sys.argv[1:])
     try:
         main(prog_name="beamline")
     except SystemExit as end:

@@ -258,11 +258,12 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
+    from beamline.core.machine import busy
     from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:
-        needs = estimate(options, MachineSpeed())
+        needs = estimate(options, MachineSpeed(), busy())
         sink(Done(needs, time=clock.now()))
     if not as_json:
         click.echo("\n".join(needs.lines()))

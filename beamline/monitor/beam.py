@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light, more_light
@@ -113,8 +113,12 @@ class BeamCheck:
     meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    drift: Annotated[float, Field(ge=0, description="fraction by which the light may drift, either way")] = 0.02
-    dip: Annotated[float, Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")] = 0.10
+    drift: Annotated[float, pydantic.Field(ge=0, description="fraction by which the light may drift, either way")] = (
+        0.02
+    )
+    dip: Annotated[
+        float, pydantic.Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")
+    ] = 0.10
 
     start = BeamState
 

@@ -18,9 +18,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.view import CellGrid, CellValues, CellView
 from recon.base.arrays import MEDIAN
+from recon.base.jit import njit
 
 SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest, thinned
@@ -43,8 +43,12 @@ class DarkCheck:
     meaning: ClassVar[str] = "a dark differs from the first one, or darks are nearly as bright as flats"
     policy: ClassVar[Policy] = Policy.LOG
 
-    drift: Annotated[float, Field(ge=0, description="counts by which a dark may differ from the first one")] = 5.0
-    light: Annotated[float, Field(ge=0, description="fraction of the flats' mean from which a dark has light")] = 0.5
+    drift: Annotated[
+        float, pydantic.Field(ge=0, description="counts by which a dark may differ from the first one")
+    ] = 5.0
+    light: Annotated[
+        float, pydantic.Field(ge=0, description="fraction of the flats' mean from which a dark has light")
+    ] = 0.5
 
     start = DarkState
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from beamline.core.jit import njit
+from recon.base.jit import njit
 
 ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
@@ -130,12 +130,27 @@ def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: in
     return (fine, coarse) if block < preview_bin else (coarse, fine)
 
 
-def block_means(image: NDArray[np.uint16], side: int) -> NDArray[np.float32]:
-    """The preview of a digest, to the bit, without its kernel: for a few frames numba would take longer to load."""
+def block_means(image: NDArray[Any], side: int) -> NDArray[np.float32]:
+    """The preview of a digest, without its kernel: for a few frames numba would take longer to load.
+
+    To the bit for counts; sums of reals are rounded in another order.
+    """
     rows, cols = (np.arange(0, n, side) for n in image.shape)
-    sums = np.add.reduceat(np.add.reduceat(image, cols, axis=1, dtype=np.uint64), rows, axis=0)
-    pixels = np.multiply.outer(*(np.diff(np.append(at, n)) for at, n in zip((rows, cols), image.shape, strict=True)))
-    return (sums / pixels).astype(np.float32)
+
+    def sums(pixels: NDArray[Any], kind: type) -> NDArray[Any]:
+        return np.asarray(np.add.reduceat(np.add.reduceat(pixels, cols, axis=1, dtype=kind), rows, axis=0))
+
+    if image.dtype == np.uint16:
+        counts = (np.diff(np.append(at, n)) for at, n in zip((rows, cols), image.shape, strict=True))
+        return (sums(image, np.uint64) / np.multiply.outer(*counts)).astype(np.float32)
+    valid = is_valid(image)
+    with np.errstate(invalid="ignore"):  # no valid pixel: NaN
+        return (sums(np.where(valid, image, 0), np.float64) / sums(valid, np.int64)).astype(np.float32)
+
+
+def is_valid(image: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels that are finite and not beyond LARGEST."""
+    return np.asarray(np.abs(image) <= np.float64(LARGEST))  # float16 holds no such number
 
 
 def checksum_of(image: NDArray[Any]) -> int:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
 from beamline.monitor.digest import FrameDigest
@@ -46,10 +46,12 @@ class FieldOfViewCheck:
     meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
     policy: ClassVar[Policy] = Policy.LOG
 
-    unlit: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
-    edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = (
-        LEAST
+    unlit: Annotated[float, pydantic.Field(ge=0, lt=1, description="share of the frame that may be without light")] = (
+        0.02
     )
+    edge: Annotated[
+        float, pydantic.Field(ge=0, description="line integral at the edges up to which the sample is inside")
+    ] = LEAST
 
     start = FieldState
 

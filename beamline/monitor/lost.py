@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -31,7 +31,9 @@ class LostCheck:
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: Annotated[float, Field(ge=0.5, le=1, description="fraction of the light without which it is lost")] = 0.5
+    alarm: Annotated[
+        float, pydantic.Field(ge=0.5, le=1, description="fraction of the light without which it is lost")
+    ] = 0.5
 
     start = LostState
 

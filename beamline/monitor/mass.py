@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
 from beamline.monitor.digest import FrameDigest
@@ -42,8 +42,10 @@ class MassCheck:
     meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="relative change of the total absorption")] = 0.03
-    frames: Annotated[int, Field(ge=1, description="projections in a row beyond the limit that make a finding")] = 3
+    warn: Annotated[float, pydantic.Field(ge=0, description="relative change of the total absorption")] = 0.03
+    frames: Annotated[
+        int, pydantic.Field(ge=1, description="projections in a row beyond the limit that make a finding")
+    ] = 3
 
     start = MassState
 

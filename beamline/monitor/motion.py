@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.change import SPAN, SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
@@ -49,10 +49,15 @@ class MotionCheck:
     meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
     policy: ClassVar[Policy] = Policy.LOG
 
-    alarm: Annotated[float, Field(ge=0, description="pixels by which the sample may shift between two views")] = 0.5
-    steps: Annotated[float, Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
+    alarm: Annotated[
+        float, pydantic.Field(ge=0, description="pixels by which the sample may shift between two views")
+    ] = 0.5
+    steps: Annotated[float, pydantic.Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
     shake: Annotated[
-        float, Field(ge=0, description="pixels, a standard deviation, by which views may stand beside the sample's way")
+        float,
+        pydantic.Field(
+            ge=0, description="pixels, a standard deviation, by which views may stand beside the sample's way"
+        ),
     ] = 0.25
 
     start = MotionState

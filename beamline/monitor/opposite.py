@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -88,9 +88,15 @@ class OppositeCheck:
     )
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="pixels by which the sample may have moved or changed")] = 0.5
-    changed: Annotated[float, Field(ge=0, description="pixels, as a shift of all, by which parts may differ")] = 1.0
-    axis: Annotated[float, Field(ge=0, description="pixels between the axis and its stated place that are said")] = 1.0
+    warn: Annotated[float, pydantic.Field(ge=0, description="pixels by which the sample may have moved or changed")] = (
+        0.5
+    )
+    changed: Annotated[
+        float, pydantic.Field(ge=0, description="pixels, as a shift of all, by which parts may differ")
+    ] = 1.0
+    axis: Annotated[
+        float, pydantic.Field(ge=0, description="pixels between the axis and its stated place that are said")
+    ] = 1.0
 
     start = OppositeState
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import njit
 
 DEAD = 0.2  # share of the light of the darkest preview block around it
 NAMED = 5  # most pixels that are named
@@ -54,7 +54,7 @@ class PixelsCheck:
     meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
+    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
 
     start = PixelsState
 

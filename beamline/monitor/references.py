@@ -12,8 +12,8 @@ from enum import StrEnum, auto
 from typing import Annotated
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.core.text import spans
 from beamline.monitor.digest import LARGEST, FrameDigest, thinned
@@ -49,15 +49,21 @@ class ReferenceLimits:
         variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
 
-    saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
-    light_over_noise: Annotated[float, Field(ge=0, description="light of a flat over the noise of a dark's pixel")] = (
-        3.0
-    )
-    light_gone: Annotated[float, Field(gt=0, lt=1, description="light that is gone, of the brightest flats")] = 0.5
-    uneven: Annotated[float, Field(gt=0, description="relative change of the light between flats of a group")] = 0.1
-    unlit: Annotated[float, Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
+    saturated: Annotated[
+        float, pydantic.Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")
+    ] = 1e-3
+    light_over_noise: Annotated[
+        float, pydantic.Field(ge=0, description="light of a flat over the noise of a dark's pixel")
+    ] = 3.0
+    light_gone: Annotated[
+        float, pydantic.Field(gt=0, lt=1, description="light that is gone, of the brightest flats")
+    ] = 0.5
+    uneven: Annotated[
+        float, pydantic.Field(gt=0, description="relative change of the light between flats of a group")
+    ] = 0.1
+    unlit: Annotated[float, pydantic.Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
     light_in_darks: Annotated[
-        float, Field(gt=0, lt=1, description="level and variance of darks over those of flats")
+        float, pydantic.Field(gt=0, lt=1, description="level and variance of darks over those of flats")
     ] = 0.2
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -31,8 +31,10 @@ class SaturationCheck:
     meaning: ClassVar[str] = "more pixels are saturated than in the darks"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
-    alarm: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it is an alarm")] = 1e-3
+    warn: Annotated[float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
+    alarm: Annotated[
+        float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it is an alarm")
+    ] = 1e-3
 
     start = SaturationState
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.digest import FrameDigest, block_side
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import njit
 
 NOISES = 4.0  # times the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
 RELATIVE = 0.25  # share of the light around it: least excess of a spot; less leaves only a faint streak

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -34,7 +34,7 @@ class TimingCheck:
     meaning: ClassVar[str] = "the frame came early or late (fly scans)"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
+    warn: Annotated[float, pydantic.Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
 
     start = TimingState
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
-from beamline.core.jit import njit
 from recon.base.arrays import median_deviation
+from recon.base.jit import njit
 
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise

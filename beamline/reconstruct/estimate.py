@@ -13,9 +13,8 @@ from beamline.projections.prepare import require_usable
 from beamline.projections.selection import check_axis, cone_of
 from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.memory import recon_memory_of
-from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.options import ReconOptions, SeveralScans
 from beamline.reconstruct.plan import planned, refuse_before_reading
-from beamline.reconstruct.several_scans import SeveralScans
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
@@ -24,12 +23,15 @@ from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
 
+_SHARED = 1.3  # from which the text says so
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate(Need):
     """What a reconstruction will take. Its seconds are without reading and correction; without scratch it is at once.
 
     Attributes:
+        busy: the seconds over those of a machine on which nothing else runs.
         shape: of the volume [z, y, x], or of several volumes [volume, z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
@@ -38,6 +40,7 @@ class Estimate(Need):
         free: bytes on the disk of the output.
     """
 
+    busy: float
     method: str
     views: int
     shape: tuple[int, ...]
@@ -66,15 +69,17 @@ class Estimate(Need):
             return f"not known: {self.method} does not say what it computes"
         most, least = (f"about {duration_text(seconds)}" for seconds in (self.seconds, self.least_seconds))
         span = f"{most}; {least} where the data end it early" if self.least_seconds < self.seconds else most
-        return f"{span}, reading and correction not counted"
+        shared = f", {self.busy:.2g} times as long as alone: others use the cores" if self.busy > _SHARED else ""
+        return f"{span}{shared}; reading and correction not counted"
 
 
-def estimate(options: ReconOptions, rates: Rates) -> Estimate:
+def estimate(options: ReconOptions, rates: Rates, busy: float = 1.0) -> Estimate:
     """Estimate for a finished scan; for a partial volume, of the missing slabs. Nothing is run. Frames
     are read only to find a region around the sample.
 
     Args:
-        rates: of this machine.
+        rates: of this machine, alone.
+        busy: see `beamline.core.machine.busy`.
 
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
@@ -96,6 +101,7 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
     missing = plan.missing if plan.slabs else slabs_of(shape[0], shape[0], 0)
     span = _span(options, method, geometry, missing, rates)
     return Estimate(
+        busy=busy,
         method=options.method.name,
         views=geometry.n_views,
         shape=shape if several == 1 else (several, *shape),
@@ -107,8 +113,8 @@ def estimate(options: ReconOptions, rates: Rates) -> Estimate:
         scratch=plan.scratch,
         output=plan.output,
         free=shutil.disk_usage(options.target.output.parent).free,
-        seconds=None if span is None else span.most,
-        least_seconds=None if span is None else span.least,
+        seconds=None if span is None else busy * span.most,
+        least_seconds=None if span is None else busy * span.least,
     )
 
 

@@ -217,7 +217,7 @@ class VolumeLooks:
     def look_for_lost_mass(self) -> bool:
         """Compare weak matter with that of FBP; whether some was lost."""
         lost = False
-        if BASELINE not in self.volumes:
+        if BASELINE not in self.volumes or len(self.volumes) == 1:
             return lost
         fbp = self.volumes[BASELINE]
         for volume in self.volumes.values():

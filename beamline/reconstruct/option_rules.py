@@ -122,6 +122,13 @@ def takers(rule: OptionRule) -> tuple[str, ...]:
     return (*((AUTO,) if getattr(Auto.traits, rule.trait) else ()), *with_trait(rule.trait))
 
 
+def _has_setting(method: str, rule: OptionRule) -> bool:
+    """Whether a method is known to take an option of methods, without a look at the others, which load torch."""
+    from recon.methods import METHODS, by_name, has_setting
+
+    return bool(rule.setting) and method in METHODS and has_setting(by_name(method), rule.setting)
+
+
 def contradiction(
     rules: Mapping[str, OptionRule],
     given: Collection[str],
@@ -157,7 +164,10 @@ def of_other_methods(
     Args:
         stated: somebody chose the method; else it is the default.
     """
-    owners = {name: takers(rule) for name, rule in rules.items() if name in given and rule.of_methods}
+    asked = {name: rule for name, rule in rules.items() if name in given and rule.of_methods}
+    if all(_has_setting(method, rule) for rule in asked.values()):
+        return ""
+    owners = {name: takers(rule) for name, rule in asked.items()}
     for name, methods in owners.items():
         if method in methods:
             continue

@@ -295,7 +295,9 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
 
     def watch(progress: Progress) -> None:
         nonlocal reached
-        share = 0.0 if progress.unit == SWEEPS_OF_TRIALS or not progress.steps else progress.step / progress.steps
+        share = (
+            0.0 if progress.unit.startswith(SWEEPS_OF_TRIALS) or not progress.steps else progress.step / progress.steps
+        )
         at = done + round((slab.own.stop - slab.own.start) * share)
         reached = max(reached, at)  # a fit's finish counts from the beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.report.figures import WIDTH, GreyWindow, grey_window, new_figure, png, show_grey
+from beamline.report.figures import WIDTH, GreyWindow, grey_window, new_figure, panels, png, show_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,16 +74,16 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
         shape: (rows, cols) of the detector.
     """
     rows, cols = shape
-    width = WIDTH / max(len(images), 2)
-    size = (width * len(images), float(np.clip(0.8 * width * rows / cols, 0.6, 4.0)) + 0.6)
-    figure = new_figure(size)
-    for axes, (title, image) in zip(figure.subplots(1, len(images), squeeze=False)[0], images.items(), strict=True):
+    width = WIDTH / max(len(images), 2) - 1.3
+    high = float(np.clip(0.85 * width * rows / cols, 0.6, 4.0))
+    figure, (row,) = panels([width] * len(images), [high], gap=1.3, right=0.5)
+    for axes, (title, image) in zip(row, images.items(), strict=True):
         shown = _show(axes, image, grey_window([image], 0.5, 99.5), shape)
         axes.tick_params(labelsize=6)
         axes.set_title(title, fontsize=8)
         axes.set_xlabel("column", fontsize=7)
         axes.set_ylabel("← row", fontsize=7)
-        figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
+        figure.colorbar(shown, ax=axes, fraction=0.05, pad=0.02).ax.tick_params(labelsize=6)
     return png(figure)
 
 

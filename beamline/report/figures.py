@@ -28,6 +28,9 @@ DPI = 110
 _FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as that goes
 WIDTH = 8.6  # inches; the report's column
 _PROFILE = 16.0  # voxels to either side of an edge
+_LEFT, _TOP, _BELOW, _GAP, BAR = 0.95, 0.35, 0.5, 0.15, 1.0  # inches around panels, between them, of a bar of colours
+_BESIDE = 0.5  # inches, of small labels
+_BESIDE_BAR = WIDTH - _LEFT - BAR
 _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
@@ -64,16 +67,18 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
-    height = np.clip(0.82 * WIDTH * rows / cols, 1.6, 6.0)
-    figure, axes = one_panel(height + 0.8)
+    thin = rows < _THIN * cols
+    height = float(np.clip(_BESIDE_BAR * rows / cols, 1.6, 6.0))
+    width = _BESIDE_BAR if thin else min(_BESIDE_BAR, height * cols / rows)
+    figure, ((axes,),) = panels([width], [height], right=BAR)
     edges = left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch
-    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=rows < _THIN * cols)
+    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=thin)
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     axes.set(
         xlabel=f"u ({unit})", ylabel=downwards("z", unit), title=f"View at {np.degrees(geometry.angles[view]):.2f}°"
     )
-    figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
+    add_bar(figure, image, "line integral")
     return png(figure)
 
 
@@ -84,7 +89,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     order = np.argsort(geometry.angles, kind="stable")
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
-    figure, axes = one_panel(4.2)
+    figure, ((axes,),) = panels([_BESIDE_BAR], [3.4], right=BAR)
     image = show_grey(axes, image_rows, grey_window([image_rows]), stretched=True)
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
@@ -92,7 +97,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     ticks = ticks[(ticks >= angles[0]) & (ticks <= angles[-1])]
     axes.set_yticks(np.interp(ticks, angles, np.arange(len(order))), [f"{angle:g}" for angle in ticks])
     axes.set(xlabel="column (px)", ylabel="angle (°)", title=f"Sinogram of row {row}, {len(order)} views")
-    figure.colorbar(image, ax=axes, label="line integral", pad=0.02)
+    add_bar(figure, image, "line integral")
     return png(figure)
 
 
@@ -136,12 +141,11 @@ def orthogonal_slices(
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     greys = matter_window(*(image for images in slices.values() for image in images))
     height = max(ny / nx, nz / nx, nz / ny, _THIN)
-    column = min((WIDTH - 1.2) / 3, 12 / (height * len(volumes)))
-    size = 1.2 + 3 * column, 0.5 + ((column - 0.5) * height + 0.5) * len(volumes)
-    figure = new_figure(size, dpi_for(nx, column - 0.5))
-    panels = figure.subplots(len(volumes), 3, squeeze=False)
-    for row, (name, images) in zip(panels, slices.items(), strict=True):
-        for i, (axes, image, (across, down, h_edges, v_edges)) in enumerate(
+    column = min((WIDTH - _BESIDE - BAR - 2 * _BESIDE) / 3, 12 / (height * len(volumes)))
+    down = [column * height] * len(volumes)
+    figure, rows = panels([column] * 3, down, dpi_for(nx, column), left=_BESIDE, gap=_BESIDE, right=BAR)
+    for row, (name, images) in zip(rows, slices.items(), strict=True):
+        for i, (axes, image, (across, downward, h_edges, v_edges)) in enumerate(
             zip(row, images, planes(first), strict=True)
         ):
             thin = image.shape[0] < _THIN * image.shape[1]
@@ -149,12 +153,10 @@ def orthogonal_slices(
             axes.tick_params(labelsize=6)
             axes.xaxis.set_major_locator(MaxNLocator(5, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=7, labelpad=1)
-            axes.set_ylabel(downwards(down, unit), fontsize=7, labelpad=1)
+            axes.set_ylabel(downwards(downward, unit), fontsize=7, labelpad=1)
             place = f"{'zyx'[i]} = {first.coordinates()[i][at[i]]:.3g} {unit}"
             axes.set_title(place if i else f"{name}, {place}", fontsize=8, pad=3)
-    bar = figure.colorbar(shown, ax=panels, shrink=0.8, pad=0.01, aspect=30)
-    bar.set_label(kind.label(unit), fontsize=7)
-    bar.ax.tick_params(labelsize=6)
+    add_bar(figure, shown, kind.label(unit), size=7)
     return png(figure)
 
 
@@ -196,8 +198,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
     angle = math.atan2(down[y, x], across[y, x])
     t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
-    figure = new_figure((WIDTH, 3.2))
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = panels([3.27, 3.27], [2.35], gap=_LEFT)
     for name, volume in volumes.items():
         at = (y + t * math.sin(angle), x + t * math.cos(angle))
         line = ndimage.map_coordinates(volume.data[z], at, order=1, mode="constant", cval=np.nan)
@@ -286,7 +287,7 @@ def round_length(length: float) -> float:
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
-    figure, axes = one_panel(2.8)
+    figure, ((axes,),) = panels([WIDTH - _LEFT - _GAP], [1.95])
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
     axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
@@ -345,6 +346,45 @@ def new_figure(size: tuple[float, float], dpi: float = DPI, constrained: bool = 
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, dpi=dpi, layout="constrained" if constrained else None)
+
+
+def panels(
+    across: Sequence[float],
+    down: Sequence[float],
+    dpi: float = DPI,
+    *,
+    left: float = _LEFT,
+    gap: float = _GAP,
+    right: float = _GAP,
+) -> tuple[Figure, list[list[Axes]]]:
+    """A figure whose panels [row][column] have places of their own, with room of one size for their labels.
+
+    A layout that measures labels takes as long as all that is drawn.
+
+    Args:
+        across, down: widths and heights of the panels, inches.
+        left, gap, right: beside the first column, between columns, and beside the last, inches; BAR: room for a bar.
+    """
+    width = left + sum(across) + gap * (len(across) - 1) + right
+    height = _TOP + sum(down) + _BELOW * len(down)
+    figure = new_figure((width, height), dpi, constrained=False)
+    lefts = [left + sum(across[:j]) + gap * j for j in range(len(across))]
+    bottoms = [height - _TOP - sum(down[: i + 1]) - _BELOW * i for i in range(len(down))]
+    return figure, [
+        [figure.add_axes((at / width, bottom / height, wide / width, high / height))
+         for at, wide in zip(lefts, across, strict=True)]
+        for bottom, high in zip(bottoms, down, strict=True)
+    ]  # fmt: skip
+
+
+def add_bar(figure: Figure, image: AxesImage, label: str, size: float = 10) -> None:
+    """A bar of the colours of an image, in the room on the right of `panels`; labels of `size` points."""
+    width, height = figure.get_size_inches()
+    high = 0.8 * (height - _TOP - _BELOW)
+    place = (width - BAR + 0.12) / width, (_BELOW + high / 8) / height, 0.16 / width, high / height
+    bar = figure.colorbar(image, cax=figure.add_axes(place))
+    bar.set_label(label, fontsize=size)
+    bar.ax.tick_params(labelsize=size)
 
 
 def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:

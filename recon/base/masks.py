@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from recon.base.arrays import Mask
 
@@ -62,7 +62,7 @@ def areas(mask: Mask) -> Mask:
     Their fill values are guesses. A single pixel or a line is interpolated well.
     """
     full = np.pad(mask, 1, constant_values=True)
-    return np.asarray(ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
+    return np.asarray(scipy.ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
 
 
 def fill(image: Image, plan: Fill) -> None:

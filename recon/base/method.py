@@ -57,7 +57,12 @@ class Progress:
 
 
 SWEEPS_OF_TRIALS = "sweeps of trials"
-"""`Progress.unit` of trials, whose planned number is that of most scans: a search goes on as long as it must."""
+"""How `Progress.unit` of trials begins: a search goes on as long as it must, so that few scans take the most."""
+
+
+def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
+    """How many sweeps of trials are planned beside so many done, and their unit."""
+    return (usual, f"{SWEEPS_OF_TRIALS} as a rule") if trial <= usual else (most, f"{SWEEPS_OF_TRIALS} at most")
 
 
 @dataclass(frozen=True, eq=False)

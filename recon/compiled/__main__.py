@@ -1,4 +1,4 @@
-"""python -m recon.compiled [CHECKOUT ...]: compiles the kernels for every level, and packs them for this Python.
+"""python -m recon.compiled [CHECKOUT ...]: compiles the kernels for every level, and packs them.
 
 Which kernels, and for which types, is taken from the archive, and from what numba has compiled for this checkout and
 for others that are named: after the tests, all that they call. So a kernel that is edited or new is compiled here for
@@ -22,7 +22,16 @@ from pathlib import Path
 from typing import Any
 
 from recon.compiled import ROOT
-from recon.compiled.archive import archive_of, digest, fresh_members, member, read_sources, unsealed, write_archive
+from recon.compiled.archive import (
+    ARCHIVE,
+    PYTHONS,
+    digest,
+    fresh_members,
+    member,
+    read_sources,
+    unsealed,
+    write_archive,
+)
 from recon.compiled.level import LEVELS
 
 PACKAGES = ("beamline", "recon", "simulators")
@@ -32,6 +41,9 @@ Index = dict[Any, str]
 
 def main() -> int:
     """Compile for each level in a process of its own, then pack."""
+    if sys.version_info[:2] != PYTHONS[0]:
+        sys.stdout.write("Make the archive by Python {}.{}: others read what it writes.\n".format(*PYTHONS[0]))
+        return 2
     for level in LEVELS:
         begin = time.perf_counter()
         # numba before recon: the level holds although this processor may have another
@@ -41,12 +53,11 @@ def main() -> int:
         sys.stdout.write(f"{level.name}: {time.perf_counter() - begin:.0f} s\n")
         if done.returncode:
             return done.returncode
-    archive = archive_of(sys.version_info[:2])
-    carried = {} if not archive.is_file() else {name: member(archive, name) for name in fresh_members(archive, ROOT)}
+    carried = {} if not ARCHIVE.is_file() else {name: member(ARCHIVE, name) for name in fresh_members(ARCHIVE, ROOT)}
     known = sorted({*carried, *_modules(ROOT)})
     members = {module: files for module in known if (files := _packed(module, carried.get(module, {})))}
-    write_archive(archive, members, ROOT)
-    sys.stdout.write(f"{archive}: {len(members)} modules, {archive.stat().st_size / 1e6:.2f} MB\n")
+    write_archive(ARCHIVE, members, ROOT)
+    sys.stdout.write(f"{ARCHIVE}: {len(members)} modules, {ARCHIVE.stat().st_size / 1e6:.2f} MB\n")
     return 0
 
 
@@ -60,7 +71,7 @@ def compile_for(checkouts: Sequence[str]) -> None:
     for module in sorted({module for module, _ in signatures}):
         loaded = importlib.import_module(module)
         for value in list(vars(loaded).values()):
-            getattr(value, "_dispatcher", None)  # `beamline.core.jit` makes it when it is first asked for
+            getattr(value, "_dispatcher", None)  # `recon.base.jit` makes it when it is first asked for
         kernels = [d for d in gc.get_objects() if issubclass(type(d), Dispatcher) and d.py_func.__module__ == module]
         for kernel in kernels:
             for types in signatures.get((module, kernel.py_func.__qualname__), ()):
@@ -99,8 +110,8 @@ def _tag() -> str:
 
 def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     """Types that kernels were compiled for, by module and name."""
-    archive, signatures = archive_of(sys.version_info[:2]), defaultdict[tuple[str, str], set[Any]](set)
-    members = [(name, member(archive, name)) for name in (read_sources(archive) if archive.is_file() else ())]
+    signatures = defaultdict[tuple[str, str], set[Any]](set)
+    members = [(name, member(ARCHIVE, name)) for name in (read_sources(ARCHIVE) if ARCHIVE.is_file() else ())]
     members += [(name, _compiled_here(name, root)) for root in roots for name in _modules(root)]
     packed = [(module, *each) for module, files in members for each in files.items() if each[0].endswith(".nbi")]
     for module, name, content in packed:

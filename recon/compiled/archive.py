@@ -28,6 +28,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 """The folder of the packages `beamline`, `recon` and `simulators`."""
+ARCHIVE = Path(__file__).with_name("kernels.zip")
+PYTHONS = ((3, 11), (3, 12), (3, 13))
+"""Where it was tried; made by the first. Object code and numba's own pickles hold nothing of Python's version."""
 SOURCES = "sources.json"
 _DAMAGE = (
     *(OSError, ValueError, KeyError, EOFError, RuntimeError, OverflowError, struct.error),
@@ -38,18 +41,12 @@ _SEAL = len(_MARK) + hashlib.sha256().digest_size
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the same files make the same archive
 
 
-def archive_of(python: tuple[int, int]) -> Path:
-    """The archive for a minor version of Python, whether it is there or not."""
-    return Path(__file__).with_name("py{}{}.zip".format(*python))
-
-
 @lru_cache(maxsize=8)
 def carried(source: bytes) -> Mapping[str, bytes]:
     """The files of numba's cache for the module whose source has this digest; none where nothing whole is carried."""
-    archive = archive_of(sys.version_info[:2])
     with contextlib.suppress(*_DAMAGE):
-        module = _carried_modules(archive).get(source.hex())
-        return {} if module is None else member(archive, module)
+        module = _carried_modules(ARCHIVE).get(source.hex()) if sys.version_info[:2] in PYTHONS else None
+        return {} if module is None else member(ARCHIVE, module)
     return {}
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -35,9 +36,10 @@ class KernelCacheFile(caching.IndexDataCacheFile):
 
     def load(self, key: Any) -> Any:
         files = carried(self._source_stamp)
-        with suppress(Exception):  # a pickle of damaged bytes can raise anything
-            if self._index_name in files:
-                return pickle.loads(files[self._overloads(files[self._index_name])[key]])  # noqa: S301 - our own
+        with suppress(Exception):  # a pickle of damaged bytes can raise anything, and there may be none
+            index = next(name for name in files if _without_python(name) == _without_python(self._index_name))
+            overloads = self._overloads(files[index])
+            return pickle.loads(files[next(overloads[known] for known in overloads if _same(known, key))])  # noqa: S301
         with suppress(Exception):
             return super().load(key)
         return None
@@ -65,6 +67,16 @@ class KernelCacheFile(caching.IndexDataCacheFile):
         yield content
         with super()._open_for_write(filepath) as file:
             file.write(sealed(content.getvalue()))
+
+
+def _without_python(name: str) -> str:
+    """A name of numba's cache without the version of Python: scaled.scaled-5.py311.nbi."""
+    return re.sub(r"\.py\d+\.", ".", name)
+
+
+def _same(known: Any, key: Any) -> bool:
+    """Keys of the same types, processor and closure. The source is the same; its bytecode is Python's affair."""
+    return bool(known[:2] == key[:2] and known[2][1] == key[2][1])
 
 
 @contextmanager

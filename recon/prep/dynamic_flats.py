@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from recon.base.arrays import F32, F64
 
@@ -82,7 +82,7 @@ class DynamicFlats:
         weights: NDArray[Any] = w
         for _ in range(2):
             left = integral + np.tensordot(weights, self.components, axes=1)
-            smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
+            smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
@@ -93,7 +93,7 @@ class DynamicFlats:
             ]
             weights, level = weights[:-1], weights[-1]
         left = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
-        smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
+        smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
         noise = float(np.median(np.abs(left - smooth)[air])) / _SMOOTHED
         return weights if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
 

@@ -20,13 +20,13 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import SWEEPS_OF_TRIALS, DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
-from recon.voxels.held_out import HeldOutTrial, beyond_chance, choose_weight
+from recon.voxels.held_out import MOST_TRIALS, HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
 from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
 from recon.voxels.noise_balance import NoiseBalance
@@ -50,11 +50,19 @@ _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
 class _Watch:
-    """Tells of sweeps, and asks whether to stop; `ended`: the last answer was yes."""
+    """Tells of sweeps, and asks whether to stop.
 
-    def __init__(self, control: RunControl, n_views: int, trials: int) -> None:
-        self._control, self._n_views, self._of_trials = control, n_views, trials
-        self._begin, self._trials, self.ended = control.now(), 0, False
+    Attributes:
+        ended: the last answer was yes.
+        made: sweeps and steps on voxels so far, without those of trials.
+    """
+
+    def __init__(self, control: RunControl, n_views: int, fits: bool = False) -> None:
+        usual, refined = PnpDct().trial_sweeps, FINISH_SWEEPS + TRIAL_STEPS
+        first, whole = (round(share * DEFAULT_STEPS) + refined if fits else 0 for share in (FIRST_SHARE, 1.0))
+        self._planned = usual + first, round(MOST_TRIALS * usual) + first + whole
+        self._control, self._n_views = control, n_views
+        self._begin, self._trials, self.made, self.ended = control.now(), 0, 0, False
 
     def asked(self) -> bool:
         self.ended = self._control.stop()
@@ -64,9 +72,13 @@ class _Watch:
         if self._control.stop_trials is not None and self._control.stop_trials():
             return True
         self._trials += 1
-        return self.sweep(self._trials, max(self._trials, self._of_trials), SWEEPS_OF_TRIALS)
+        return self.sweep(self._trials, *sweeps_of_trials(self._trials, *self._planned))
 
-    def sweep(self, number: int, of: int, unit: str = "sweeps on voxels") -> bool:
+    def refined(self, number: int, of: int) -> bool:
+        self.made = number
+        return self.sweep(number, of, "sweeps on voxels")
+
+    def sweep(self, number: int, of: int, unit: str) -> bool:
         if self._control.on_progress is not None:
             nan, seconds = math.nan, self._control.now() - self._begin
             self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
@@ -228,8 +240,7 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
     data, weights = masked(problem.projections, problem.use.weights)
     if not data.any():
         return Candidates()
-    trials = PnpDct().trial_sweeps + round(FIRST_SHARE * DEFAULT_STEPS) + FINISH_SWEEPS + TRIAL_STEPS
-    watch, decide = _Watch(control, problem.geometry.n_views, trials), Decisions(problem.seed)
+    watch, decide = _Watch(control, problem.geometry.n_views, fits=True), Decisions(problem.seed)
     method = _Planning(fit, control, settings)
     projector = Projector(problem.geometry, problem.grid)
     solve(method, projector, data, weight=weights, watch=Watch(on_trial=watch.trial), decide=decide)
@@ -242,10 +253,16 @@ def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fi
 
 @dataclass
 class _Finish:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`; `patches`: these may follow."""
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`.
+
+    Attributes:
+        patches: these may follow.
+        planned: sweeps, and steps with patches where these follow.
+    """
 
     iterations: int
     patches: bool
+    planned: int = 0
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(HeldOutTrial.of, problem))
@@ -253,11 +270,13 @@ class _Finish:
         if self.patches:
             patches = choose_patches(problem, weight, trial)
             strength = patches.strength if patches.better else 0.0
-        return refine(problem, x, weight, strength, self.iterations, PnpDct().iterations)
+        steps = PnpDct().iterations
+        self.planned = self.iterations + (steps if strength else 0)
+        return refine(problem, x, weight, strength, self.iterations, steps)
 
 
 class Finished(NamedTuple):
-    """The refined volume, and the sweeps that it took; 0: it is the fit's."""
+    """The refined volume, and the sweeps of total variation that it took; 0: it is the fit's."""
 
     volume: Volume
     sweeps: int
@@ -304,12 +323,13 @@ def finish(
     beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
     if beyond is not None:
         data -= beyond
-    watch, count = _Watch(control, problem.geometry.n_views, PnpDct().trial_sweeps), sweeps or FINISH_SWEEPS
+    watch, count = _Watch(control, problem.geometry.n_views), sweeps or FINISH_SWEEPS
+    method = _Finish(count, sweeps is None)
     refined = solve(
-        _Finish(count, sweeps is None), projector, data, weight=weights, start=start, nonnegative=nonnegative,
-        watch=Watch(lambda sweep, _: watch.sweep(sweep, max(sweep, count)), watch.trial), decide=decide,
+        method, projector, data, weight=weights, start=start, nonnegative=nonnegative,
+        watch=Watch(lambda sweep, _: watch.refined(sweep, method.planned), watch.trial), decide=decide,
     )  # fmt: skip
-    return Finished(refined, count)
+    return Finished(refined, min(count, watch.made))
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> tuple[F32, F32 | None] | None:

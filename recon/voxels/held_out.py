@@ -49,6 +49,8 @@ TRIALS = 4
 """Trials of a strength, as a rule: 3 to 6 on five scans, some of fewer columns, see `columns_of_matter`."""
 CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
+MOST_TRIALS = (2 + _OCTAVES) / TRIALS
+"""The most sweeps of trials, over those as a rule."""
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:

@@ -20,8 +20,9 @@ from numba import get_num_threads, set_num_threads
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
-from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.volume import Grid, Volume
+from recon.voxels.held_out import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.resolution import smoothed
 from recon.voxels.voxel_problem import VoxelProblem
@@ -152,10 +153,8 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
         nonlocal trial
         trial += 1
         if control.on_progress is not None:
-            nan, of = math.nan, max(trials, trial)
-            control.on_progress(
-                Progress(trial, of, control.now() - begin, nan, nan, 0, geometry.n_views, unit=SWEEPS_OF_TRIALS)
-            )
+            nan, (of, unit) = math.nan, sweeps_of_trials(trial, trials, round(MOST_TRIALS * trials))
+            control.on_progress(Progress(trial, of, control.now() - begin, nan, nan, 0, geometry.n_views, unit=unit))
         return control.stop_of_trials()
 
     def report(iteration: int, residual: float) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
-from numba import config
+from recon.base.jit import thread_count
 
 SMALL = 1 << 16  # Pixels below which threads cost more than they gain
 
@@ -15,7 +15,7 @@ def share_rows(work: Callable[[int, int], None], shape: tuple[int, int]) -> None
     """Call `work(first, end)` for bands that cover all rows of a frame of `shape`, in NUMBA_NUM_THREADS threads (by
     default one a core); `work` releases the interpreter's lock. Not numba's own threads: two threads must not use those
     at once, and a camera is read while other threads compute."""
-    threads = config.NUMBA_NUM_THREADS if shape[0] * shape[1] > SMALL else 1
+    threads = thread_count() if shape[0] * shape[1] > SMALL else 1
     if threads == 1:
         return work(0, shape[0])
     edges = [shape[0] * k // threads for k in range(threads + 1)]

@@ -12,10 +12,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
+from recon.base.jit import njit, thread_count
 from simulators.pixels.bands import share_rows
 
 Image = NDArray[np.float64]
@@ -58,7 +58,7 @@ def broad_blur(image: Image, width: float, transfer: Transfer) -> Image:
     small = np.empty((rows // factor, cols // factor))
     share_rows(lambda first, end: _shrink(first, end, image, small), small.shape)
     laplacian = _symbol(small.shape[0])[:, None] + _symbol(small.shape[1])
-    threads = config.NUMBA_NUM_THREADS
+    threads = thread_count()
     spectrum = fft.dctn(small, overwrite_x=True, workers=threads)
     spectrum *= transfer(laplacian * (width / factor) ** 2)
     blurred = fft.idctn(spectrum, overwrite_x=True, workers=threads)

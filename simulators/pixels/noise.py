@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.base.jit import njit
 from simulators.frame.shot import CannotExposeError
 from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal

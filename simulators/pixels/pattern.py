@@ -6,10 +6,10 @@ Only the pixels of the frame are computed; they are the same for any ROI and bin
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
+from recon.base.jit import njit
 from simulators.frame.shot import Image, Shot, fixed_rng
 from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal

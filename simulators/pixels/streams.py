@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.base.jit import njit
 
 STEP = np.uint64(0x9E3779B97F4A7C15)
 """Odd, 2^64 over the golden ratio: the states of a stream are this far apart."""

@@ -252,7 +252,7 @@ def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     """Print the time and memory of the sweep."""
-    from beamline.core.machine import Need
+    from beamline.core.machine import Need, busy
     from beamline.core.machine_speed import MachineSpeed
     from beamline.core.text import count, size
     from beamline.features.sweeps.sweep import sliced
@@ -262,7 +262,7 @@ def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     with json_events(as_json) as sink:
         speed = MachineSpeed()
         with sliced([each for _, each in trials]) as cut:
-            needs = [estimate(each, speed) for each in cut]
+            needs = [estimate(each, speed, busy()) for each in cut]
         together = Need.in_turn(needs)
         total = None if any(each.seconds is None for each in needs) else together.seconds
         facts: dict[str, Any] = {"slices": len(needs), "memory": together.memory, "seconds": total}

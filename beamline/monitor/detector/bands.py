@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext, light
@@ -86,7 +86,9 @@ class BandsCheck:
 
     alarm: Annotated[
         float,
-        Field(ge=0, lt=1, description="fraction of light that a preview row or column may lose against the others"),
+        pydantic.Field(
+            ge=0, lt=1, description="fraction of light that a preview row or column may lose against the others"
+        ),
     ] = 0.1
 
     start = BandsState

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter, running_mean
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import njit
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
 STRIP = 6  # neighbouring rows that are used together
@@ -64,7 +64,9 @@ class BlurCheck:
     meaning: ClassVar[str] = "the view is less sharp than the views before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")] = 0.3
+    warn: Annotated[
+        float, pydantic.Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")
+    ] = 0.3
 
     start = BlurState
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
@@ -43,8 +43,10 @@ class GainCheck:
     meaning: ClassVar[str] = "the light, or the camera's gain, stepped between this view and the one before"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="relative change of the light from one view to the next")] = 0.01
-    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.1
+    warn: Annotated[
+        float, pydantic.Field(ge=0, description="relative change of the light from one view to the next")
+    ] = 0.01
+    alarm: Annotated[float, pydantic.Field(ge=0, description="relative change that is an alarm")] = 0.1
 
     start = GainState
 

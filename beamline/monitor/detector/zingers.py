@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import pydantic
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -36,7 +36,7 @@ class ZingersCheck:
     meaning: ClassVar[str] = "many bright spots that are in this frame only"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, le=1, description="zingers over pixels that a view may have")] = 1e-4
+    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="zingers over pixels that a view may have")] = 1e-4
 
     start = ZingersState
 

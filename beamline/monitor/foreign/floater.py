@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field
+import pydantic
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.change import MOST_STEPS
@@ -80,7 +80,7 @@ class FloaterCheck:
     meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
+    warn: Annotated[float, pydantic.Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
 
     start = FloaterState
 

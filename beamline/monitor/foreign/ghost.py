@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
 
-from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame
 from recon.base.arrays import median_deviation
+from recon.base.jit import njit
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
@@ -163,8 +163,10 @@ class GhostCheck:
     )
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the ghost")] = 0.01
-    alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
+    warn: Annotated[
+        float, pydantic.Field(ge=0, description="relative change of the light in the middle of the ghost")
+    ] = 0.01
+    alarm: Annotated[float, pydantic.Field(ge=0, description="relative change that is an alarm")] = 0.8
 
     start = GhostState
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
+import pydantic
 import scipy
-from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -49,7 +49,7 @@ class ModelCheck:
     meaning: ClassVar[str] = "a part of the view differs from the render of the reconstruction that was given"
     policy: ClassVar[Policy] = Policy.LOG
 
-    warn: Annotated[float, Field(ge=0, description="standard deviations by which a part may differ")] = 6.0
+    warn: Annotated[float, pydantic.Field(ge=0, description="standard deviations by which a part may differ")] = 6.0
 
     start = ModelState
 

@@ -21,9 +21,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from beamline.core.jit import njit
 from beamline.monitor.view import CellValues
 from recon.base.arrays import median_deviation
+from recon.base.jit import njit
 
 SEED = 4  # steps of an octave whose sum shows where a track may go on
 SLOWEST, SLOW = 1.5, 4.0  # cells a step: what moves less is mostly taken off with the neighbours; more, in views of one

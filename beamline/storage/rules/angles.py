@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,9 +152,16 @@ class CoarseViews:
     source: ScanSource
     light: ViewLight
     rows: NDArray[np.int64]
+    _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def depth(self, row: int) -> NDArray[np.float64]:
-        """Line integrals [row, col] of a view."""
+        """Line integrals [row, col] of a view, smoothed along its rows, so that it has two columns less."""
+        if row not in self._depths:
+            lines = self._lines(row)
+            self._depths[row] = (lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:]) / 4
+        return self._depths[row]
+
+    def _lines(self, row: int) -> NDArray[np.float64]:
         cells = reference_frame(self.source, row).cells
         assert cells is not None
         if self.light.dark is None or self.light.flat is None:
@@ -168,7 +175,7 @@ class CoarseViews:
         """Whether the view has light and shows a sample."""
         known = reference_frame(self.source, row).cells
         if known is None or self.light.dark is None or self.light.flat is None:
-            return bool(np.ptp(self.depth(row)))
+            return bool(np.ptp(self._lines(row)))
         return brightness(known, self.light.dark, self.light.flat) > LEAST * self.light.usual
 
     def unlike(self, pairs: Sequence[tuple[int, int]], mirrored: bool, reach: float = 0.25) -> float:
@@ -177,12 +184,11 @@ class CoarseViews:
         `reach`: how far mirror images are moved, of the field: twice as far as the axis is from its middle. It is
         doubled once where the best move is the farthest.
         """
-        farthest = int(reach * self.depth(pairs[0][0]).shape[1])
+        farthest = int(reach * (self.depth(pairs[0][0]).shape[1] + 2))
         moves = np.arange(-farthest * _PARTS, farthest * _PARTS + 1) / _PARTS if mirrored else np.zeros(1)
         curve = np.zeros(len(moves))
         for one, other in pairs:
             a, b = self.depth(one), self.depth(other)[:, :: -1 if mirrored else 1]
-            a, b = ((each[:, :-2] + 2 * each[:, 1:-1] + each[:, 2:]) / 4 for each in (a, b))
             curve += [1 - _correlation(*_laid_on(a, b, move)) for move in moves.tolist()]
         if mirrored and reach < 0.5 and int(np.argmin(curve)) in (0, len(curve) - 1):
             return self.unlike(pairs, mirrored, 2 * reach)

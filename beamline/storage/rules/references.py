@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import block_means, check_block, digest
+from beamline.monitor.digest import block_means, check_block, is_valid
 from beamline.monitor.flats_with_sample import (
     brighter_in_places,
     flats_like_views,
@@ -254,13 +254,11 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if not (flats.size and darks.size and views_differ(source)):
         return source.exposures
-    dark, light = (
-        np.mean([reference_frame(source, row).cells for row in rows.tolist()], axis=0) for rows in (darks, flats)
-    )
+    dark, light = (mean_cells(source, rows) for rows in (darks, flats))
     lit = lit_places(light - dark)
-    seen = [reference_frame(source, row).cells for row in some_of(views, VIEWS).tolist()]
-    shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if cells is not None]
-    most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if lit.any() else 0.0
+    seen = [mean_cells(source, row) for row in some_of(views, VIEWS)[:, None]]
+    shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
+    most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
     of_views = source.exposures[views]
     for each in (of_views.max(), np.median(of_views), of_views.min()):
         if each <= (1 + _BRIGHTER) * most:
@@ -268,24 +266,29 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
     return source.exposures
 
 
+def mean_cells(source: ScanSource, rows: Frames) -> NDArray[np.float32]:
+    """Cells of the mean of frames."""
+    return np.asarray(np.nan_to_num(np.mean(cells_of(source, rows), axis=0)), np.float32)
+
+
+def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:
+    """Cells of each of some frames."""
+    return [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
+
+
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     """Statistics of an image, with its cells."""
-    saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    block = check_block(image.shape)
-    side = max(1, image.shape[1] // CELLS)
-    about = row, FrameKind.INVALID, np.nan
-    if image.dtype == np.uint16:
-        saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-        frame = ReferenceFrame.seen(*about, saturated, block_means(image, block), block)
-        held = np.bincount(image.ravel())
-        end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else int(image.max())
-        beside = BY_CHANCE if end == held.size - 1 else max(BY_CHANCE, int(held[end - 1]))
-        shared = (
-            max(0, int(held[end]) - beside) / image.size
-        )  # counts that thin out towards a few hot pixels do not end
-        return replace(frame, cells=block_means(image, side), largest=float(end), at_largest=shared)
-    known = digest(image, saturation, block)
-    frame = ReferenceFrame.of(*about, known, block)
-    cells = digest(image, None, side).preview
-    frame = replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
-    return frame if image.dtype.kind in "ui" else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0
+    counts = image.dtype.kind in "ui"
+    saturation = full_scale(float(image.max())) if counts else None
+    saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
+    block, side = check_block(image.shape), max(1, image.shape[1] // CELLS)
+    frame = ReferenceFrame.seen(row, FrameKind.INVALID, np.nan, saturated, block_means(image, block), block)
+    frame = replace(frame, cells=block_means(image, side))
+    if image.dtype != np.uint16:
+        frame = replace(frame, invalid=1 - float(np.mean(is_valid(image))))
+        return frame if counts else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0
+    held = np.bincount(image.ravel())
+    end = int(np.flatnonzero(held > BY_CHANCE)[-1]) if held.max() > BY_CHANCE else int(image.max())
+    beside = BY_CHANCE if end == held.size - 1 else max(BY_CHANCE, int(held[end - 1]))
+    shared = max(0, int(held[end]) - beside) / image.size  # counts that thin out towards a few hot pixels do not end
+    return replace(frame, largest=float(end), at_largest=shared)

@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from recon.base.jit import njit
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import BelowOne, NotNegative, Positive
 from simulators.frame.shot import CannotExposeError, Image, Shot

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numba import config, njit
 from numpy.typing import NDArray
 from pydantic import Field
 from scipy import fft
 
+from recon.base.jit import njit, thread_count
 from simulators.effects.chain import ImageEffect
 from simulators.frame.detector import Detector
 from simulators.frame.mapping import NotNegative, Positive
@@ -139,7 +139,7 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
     phase = (2 * math.pi * turns).astype(np.float32)
     amplitude = np.exp(-0.5 * depth.astype(np.float32))
     rows, cols = (np.exp(-0.25j * np.pi * area * (np.arange(n) / n) ** 2).astype(np.complex64) for n in depth.shape)
-    threads = config.NUMBA_NUM_THREADS
+    threads = thread_count()
     wave = np.empty(depth.shape, np.complex64)
     for part, wanted in ((wave.real, np.cos), (wave.imag, np.sin)):
         part[:] = fft.dctn(amplitude * wanted(phase), norm="ortho", overwrite_x=True, workers=threads)

@@ -16,9 +16,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.base.jit import njit
 from simulators.pixels.bands import share_rows
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed
 from simulators.samples.bodies.view import View

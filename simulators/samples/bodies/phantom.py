@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.jit import njit
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose

@@ -14,8 +14,8 @@ from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -114,8 +114,8 @@ def _hull(vertices: tuple[tuple[float, ...], ...]) -> Hull:
     points = np.array(vertices, dtype=np.float64)
     size = float(np.ptp(points, axis=0).max())
     try:
-        convex = ConvexHull(points / size)
-    except QhullError:
+        convex = scipy.spatial.ConvexHull(points / size)
+    except scipy.spatial.QhullError:
         raise ValueError(
             f"polyhedron: its {len(points)} vertices lie in a plane; a body needs four that do not"
         ) from None

@@ -106,8 +106,8 @@ def _place(
         for _ in range(ROUNDS):
             point = rng.uniform(-1, 1, (CANDIDATES, 3)) * (radius, radius, half_height - own - gap)
             clear = np.hypot(point[:, 0], point[:, 1]) < radius - own - gap
-            distance = np.linalg.norm(point[:, None] - centres[None, :i], axis=2)
-            clear &= (distance > own + reach[:i] + gap).all(axis=1)
+            dx, dy, dz = (point[clear, k, None] - centres[:i, k] for k in range(3))
+            clear[clear] = (np.sqrt(dx * dx + dy * dy + dz * dz) > own + reach[:i] + gap).all(axis=1)
             if half_height - own - gap > 0 and clear.any():
                 centres[i] = point[np.argmax(clear)]
                 break

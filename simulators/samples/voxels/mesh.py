@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.base.jit import njit
 from simulators.frame.mapping import Positive, build
 from simulators.samples.sample import ReadVolume
 from simulators.samples.voxels.voxels import Voxels

@@ -13,9 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numba import config, njit
 from numpy.typing import NDArray
 
+from recon.base.jit import njit, thread_count
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 
@@ -73,7 +73,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
             _any(lattice, rays, axes, origin, low, high, out)
 
     # Not numba's get_num_threads, which starts numba's own threads and slows torch down.
-    threads = min(int(config.NUMBA_NUM_THREADS), detector.shape[0])
+    threads = min(thread_count(), detector.shape[0])
     if threads == 1:
         rows(0, detector.shape[0])
         return out

@@ -212,6 +212,16 @@ def test_block_means_are_the_preview_of_a_digest(shape: tuple[int, int]) -> None
     np.testing.assert_array_equal(block_means(image, 4), digest(image, 60_000, 4).preview)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float16, np.float32, np.float64])
+def test_block_means_of_other_types_are_of_the_valid_pixels(dtype: type) -> None:
+    image = np.random.default_rng(0).integers(0, 200, (9, 13)).astype(dtype)
+    if image.dtype.kind == "f":
+        image[:4, :4], image[5, 5], image[0, 7] = np.nan, np.inf, -np.inf
+    if image.dtype.itemsize > 2:
+        image[8, 12] = 1e30 if image.dtype.kind == "f" else -(2**31)
+    np.testing.assert_allclose(block_means(image, 4), digest(image, None, 4).preview, rtol=1e-6)
+
+
 @given(st.integers(1, 1200), st.integers(1, 1200))
 def test_thinning_bounds_the_work_and_leaves_small_previews_whole(rows: int, cols: int) -> None:
     preview = np.broadcast_to(np.float32(0), (rows, cols))

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from beamline.core.jit import _Kernel
 from beamline.monitor import watch
 from beamline.monitor import watch as scan
 from beamline.monitor.check import Flag, Level, Look, ScanContext
@@ -18,6 +17,7 @@ from beamline.monitor.stuck import StuckCheck
 from beamline.monitor.timing import TimingCheck
 from beamline.monitor.watch import rehearse, start
 from drivers.base.frame import Frame, FrameKind
+from recon.base.jit import _Kernel
 
 CONTEXT = ScanContext(saturation=65535, pixels=100)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
@@ -67,6 +67,16 @@ def test_voxels_add_what_the_gaussians_lack() -> None:
     qualities += [psnr(truth, finish(_of(g), g, _problem(data), sweeps).volume.data) for sweeps in (1, 3, 9)]
     assert all(later > before + 1 for before, later in pairwise(qualities))
     assert qualities[-1] > 30
+
+
+def test_sweeps_are_told_with_how_many_there_are() -> None:
+    said: list[Progress] = []
+    data = Projector(VIEWS, GRID).forward(_box())
+    finish(_of(_blob()), _blob(), _problem(data), control=RunControl(on_progress=said.append))
+    sweeps = [each for each in said if not each.unit.startswith(SWEEPS_OF_TRIALS)]
+    assert [each.step for each in sweeps] == list(range(1, len(sweeps) + 1))
+    assert {each.steps for each in sweeps} == {len(sweeps)}
+    assert all(each.step <= each.steps for each in said) and len(said) > len(sweeps)
 
 
 def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:

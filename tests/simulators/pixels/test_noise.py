@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
-from numba import njit
 from numpy.typing import NDArray
 from scipy import special, stats
 
+from recon.base.jit import njit
 from simulators.frame.shot import CannotExposeError
-from simulators.pixels import bands
 from simulators.pixels.noise import LEAST, add_normal, expansion, poisson, searched, summed
 from tests.simulators import chance
 
@@ -22,7 +22,7 @@ def _poisson(mean: float, seed: int = 0) -> NDArray[np.float64]:
     return poisson(np.full(SHAPE, mean), np.random.default_rng(seed))
 
 
-@njit
+@njit()
 def _expansions(w, mean):  # type: ignore[no-untyped-def]
     out = np.empty((2, w.size))
     for i in range(w.size):
@@ -112,7 +112,7 @@ def test_neighbours_and_frames_are_independent() -> None:
 def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr(bands.config, "NUMBA_NUM_THREADS", threads)
+        monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
         frame = _poisson(40.0)
         add_normal(frame, 0.4, np.random.default_rng(5))
         frames.append(frame)

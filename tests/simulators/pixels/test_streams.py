@@ -7,17 +7,17 @@ import math
 
 import numpy as np
 import pytest
-from numba import njit
 from numpy.typing import NDArray
 from scipy import stats
 
+from recon.base.jit import njit
 from simulators.pixels.streams import STEP, TAIL, begin, layers, mix, normal, uniform
 from tests.simulators import chance
 
 N = 400_000
 
 
-@njit
+@njit()
 def _normals(key, rows, cols):  # type: ignore[no-untyped-def]
     out = np.empty((rows, cols))
     for row in range(rows):
@@ -27,7 +27,7 @@ def _normals(key, rows, cols):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit
+@njit()
 def _uniforms(state, n):  # type: ignore[no-untyped-def]
     out = np.empty(n)
     for i in range(n):
@@ -35,7 +35,7 @@ def _uniforms(state, n):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit
+@njit()
 def _bits(state, n):  # type: ignore[no-untyped-def]
     out = np.empty(n, np.uint64)
     for i in range(n):
@@ -72,7 +72,7 @@ def test_normal_numbers_are_normal(normals: NDArray[np.float64]) -> None:
     chance.normal_like(normals)
 
 
-@njit
+@njit()
 def _tail(state, n):  # type: ignore[no-untyped-def]
     found = [0.0 for _ in range(0)]
     for _ in range(n):

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.base.jit import njit
 from simulators.samples.bodies.packing import ELLIPSOID, POLYHEDRON, pack
 from simulators.samples.bodies.solids import Solid
 

@@ -14,10 +14,10 @@ from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon.base.jit import njit
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
 from simulators.samples.builders.piece import Gap, Micrometres, Millimetres, Piece, PieceBuilder, check_roles
 

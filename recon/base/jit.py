@@ -6,7 +6,12 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
-import recon  # noqa: F401 - it says what processor numba compiles for
+
+def thread_count() -> int:
+    """Threads that numba uses, by NUMBA_NUM_THREADS."""
+    import numba
+
+    return int(numba.config.NUMBA_NUM_THREADS)
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
