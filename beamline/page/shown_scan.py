@@ -23,7 +23,6 @@ from recon.base.geometry import Geometry
 from recon.base.views import spread, spread_views
 from recon.base.volume import Grid
 from recon.prep.align import closest_pair, find_axis
-from recon.voxels.direct import direct
 
 F32 = NDArray[np.float32]
 _REFERENCES = 8  # darks and flats that are averaged
@@ -139,6 +138,8 @@ class ShownScan:
         Raises:
             DataError: as `axis`.
         """
+        from recon.voxels.direct import direct  # here: it loads numba, which slices of views do not need
+
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
         data, angles = self._lines[::every], self._source.angles[self._ids[::every]]

@@ -34,7 +34,8 @@ _HALF_A_PIXEL = 0.5  # doubles edges as far as the resolution, as for the monito
 _MOST_OF_THEM = 5, 95  # percent of views: one that a crumb crosses does not count
 _NOISE = 3.3  # standard deviations between these percentiles, of noise alone
 _ACROSS = 1.0  # columns: a teapot that hardens by 12 % has 0.7, a measured tooth 0.5
-_STEP_OF_LIGHT, _OF_OTHERS = 0.1, 12.0  # of line integral, as the monitor's alarm `gain`; times the usual step
+_STEP_OF_LIGHT = 0.1  # of line integral, as the monitor's alarm `gain`
+_OF_LOCAL, _ALTERNATING = 3.0, 0.9  # times the change to the next view, as angles differ by so much; share of the views
 _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in standard deviations of most views
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
@@ -93,7 +94,8 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         return {}
     some = _evenly(len(data), _VIEWS)
     if cut_sides(data, geometry) or _air_is_off(data, some):
-        laws = [_steady(data, some, prepared.projections.view_ids[some])]
+        frames = prepared.projections.view_ids[some]
+        laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         return _told(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
@@ -170,18 +172,29 @@ def _mass_noise(prepared: PreparedProjections, views: Sequence[F32]) -> float:
     return noise_level(np.stack(some)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
 
 
-def _steady(data: F32, some: NDArray[np.intp], frames: NDArray[np.int64]) -> Law:
-    """The line integral of a whole view changes as little from one to the next as most, where no air tells of it."""
-    steps = np.diff([np.median(data[view]) for view in some])
-    at = int(np.abs(steps).argmax())
-    sentence = (
-        f"From frame {frames[at]} to frame {frames[at + 1]} the line integrals of the whole view change by "
-        f"{steps[at]:+.2f} at once (others by {np.median(np.abs(steps)):.2g}), and no air beside the sample corrects "
-        "it: light, exposure or filter changed, or views of another scan are among them. Choose views that belong "
-        "together with --views, or say which columns are air."
+def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]) -> Law:
+    """Views half a turn apart are mirror images, and the light does not alternate, where no air tells of it."""
+    reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
+    around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
+    levels = np.array([np.median(data[view][:, around]) for view in some])
+    steps = np.diff(levels)
+    usual, apart = float(np.median(np.abs(steps))), np.abs(np.abs(angles[:, None] - angles) - np.pi)
+    opposite = apart <= 1.01 * float(np.median(np.abs(np.diff(np.sort(angles)))))
+    local = np.maximum(np.append(np.abs(steps), 0), np.append(0, np.abs(steps)))
+    change = np.where(opposite, np.abs(levels[:, None] - levels) - _OF_LOCAL * np.maximum(local[:, None], local), -1)
+    first, last = np.unravel_index(int(change.argmax()), change.shape)
+    size = float(max(change[first, last], 0)) if opposite.any() else np.nan
+    what = (
+        f"Frames {min(frames[[first, last]])} and {max(frames[[first, last]])}, half a turn apart, see one and the "
+        f"same matter, but differ by {abs(levels[first] - levels[last]):.2f} of line integral"
     )
-    tolerance = max(_STEP_OF_LIGHT, _OF_OTHERS * float(np.median(np.abs(steps))))
-    return Law("steps of the light", float(abs(steps[at])), tolerance, "of line integral", sentence)
+    if usual > _STEP_OF_LIGHT and np.mean(steps[1:] * steps[:-1] < 0) > _ALTERNATING:
+        size, what = usual, f"From view to view line integrals of the whole view rise and fall in turn by {usual:.2f}"
+    sentence = (
+        f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
+        "another scan are among them. Choose views that belong together with --views, or say which columns are air."
+    )
+    return Law("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
 
 
 def _upside_down(shown: ViewMoments, frames: NDArray[np.int64]) -> Law:

@@ -33,7 +33,7 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
     findings = [*scan_findings(source), *scan_ended(source)]
-    findings += [finding for rule in (references_usable, darks_beside_views) for finding in rule(source, asked.accepted)]
+    findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:

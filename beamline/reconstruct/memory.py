@@ -16,8 +16,7 @@ from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.step import StepMemory
 from beamline.projections.view_geometry import stated_geometry
-from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.several_scans import views_of_others, with_as_many_views
+from beamline.reconstruct.options import ReconOptions, views_of_others, with_as_many_views
 from beamline.reconstruct.workers import cluster
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry

@@ -6,18 +6,24 @@ import math
 import os
 import shutil
 import tempfile
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import REPORT, refuse_existing
+from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
 from beamline.core.text import size
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.view_geometry import stated_geometry
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
-from beamline.reconstruct.several_scans import SeveralScans
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writer_lock import PATIENCE
@@ -34,6 +40,57 @@ from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
+
+
+@runtime_checkable
+class SeveralScans(Protocol):
+    """A source of views, where `SourceOptions` is one of a single scan."""
+
+    @property
+    def scans(self) -> tuple[SourceOptions, ...]:
+        """The facts of the first one are in the report."""
+
+    @property
+    def path(self) -> Path | str:
+        """Of the first scan."""
+
+    def open(self, *, follow: bool = False) -> ScanSource:
+        """The first scan."""
+
+    def refuse(self, method: Method, given: Collection[str]) -> None:
+        """Raises ConfigError where the scans do not go with the method or the options of these names; opens none."""
+
+    def require_alike(self, selection: Selection) -> None:
+        """Raises ConfigError where the scans state what does not go together; reads no frame."""
+
+    def prepare(
+        self, selection: Selection, warn: Warn, check: Callable[[Geometry], object], phases: Phases | None
+    ) -> PreparedProjections:
+        """As `prepare_projections`, of all scans; `check` gets the geometry of each.
+
+        Raises:
+            ConfigError: scans that do not go together. DataError: a scan cannot be read.
+        """
+
+
+def scans_of(source: SourceOptions | SeveralScans) -> tuple[SourceOptions, ...]:
+    """The scans, or the one that there is."""
+    return source.scans if isinstance(source, SeveralScans) else (source,)
+
+
+def views_of_others(source: SourceOptions | SeveralScans, selection: Selection) -> int:
+    """Views of the scans after the first one, before any frame is read; 0 where there is one scan."""
+    views = 0
+    for each in scans_of(source)[1:]:
+        with each.open() as scan:
+            views += stated_geometry(scan, selection).n_views
+    return views
+
+
+def with_as_many_views(geometry: Geometry, views: int) -> Geometry:
+    """So many views like these."""
+    return geometry if views == geometry.n_views else geometry.select(np.resize(np.arange(geometry.n_views), views))
+
 
 _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 

@@ -33,9 +33,15 @@ from beamline.reconstruct.memory import (
     refuse_whole,
     surely_weighted,
 )
-from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.options import (
+    OutputPaths,
+    ReconOptions,
+    SeveralScans,
+    scans_of,
+    views_of_others,
+    with_as_many_views,
+)
 from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.several_scans import SeveralScans, scans_of, views_of_others, with_as_many_views
 from beamline.reconstruct.workers import cluster
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource

@@ -27,8 +27,7 @@ from beamline.core.process import json_object
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import ending_in, state_ending
-from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.ending import add_exchange_view, ending_in, state_ending
 from beamline.storage.writers.rows import altered_rows, record_checksums, require_earlier
 from drivers.base.frame import FrameKind
 

@@ -29,8 +29,16 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import DIED, RUNNING, ScanEnding, ending_in, state_ending, state_words
-from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
+from beamline.storage.writers.ending import (
+    DIED,
+    RUNNING,
+    ScanEnding,
+    ending_in,
+    has_exchange_view,
+    state_ending,
+    state_words,
+    with_exchange_view,
+)
 from beamline.storage.writers.rows import altered_rows
 
 COMPARED = 2**31  # bytes of the last frames: more than a machine that loses power has not brought to the disk yet

@@ -1,6 +1,9 @@
 """Structure: the objects of an HDF5 file and the other files that it draws on, looked at before any of them is opened.
 
 HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of deeply nested groups.
+
+Functions on shape, type and place of voxels raise ValueError, which the reader of a format turns into a DataError with
+the path.
 """
 
 from __future__ import annotations

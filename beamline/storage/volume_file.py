@@ -242,8 +242,8 @@ def _only(path: Path, axes: dict[str, int]) -> str:
 
         if (scan := scan_format(path)) is not None:
             raise DataError(
-                f"{path} is a scan ({scan}), not a volume: `beamline recon {path}` makes a volume of it. To look at "
-                f"one of its arrays, name it in `view` as FILE::NAME ({', '.join(volumes) or 'none'})."
+                f"{path} is a scan ({scan}), not a volume: `beamline recon {path}` makes a volume of it, and "
+                f"`beamline view {path}` shows its frames."
             )
         raise DataError(
             f"{path} holds {len(volumes)} volumes ({', '.join(volumes) or 'none'}); name one as its dataset, in `view` "

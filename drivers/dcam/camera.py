@@ -10,10 +10,9 @@ from typing import Any
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from drivers.dcam import properties as cooling
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import BufFrame, CaptureMode, CaptureState, Error, Property
-from drivers.dcam.properties import Properties
+from drivers.dcam.properties import Progress, Properties, wait_until_cold
 from drivers.dcam.ring import START_TIMEOUT, Ring, require_stamps, seconds_of
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, description, read_settings, read_timing
@@ -161,10 +160,10 @@ class DcamCamera:
         if not self._closed:
             self._free()
 
-    def wait_until_cold(self, timeout: float, progress: cooling.Progress = lambda celsius, status: None) -> float:
+    def wait_until_cold(self, timeout: float, progress: Progress = lambda celsius, status: None) -> float:
         """See `drivers.dcam.properties.wait_until_cold`."""
         self._require_open()
-        return cooling.wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
+        return wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity and state of the camera, and the frames lost in the current or last run."""

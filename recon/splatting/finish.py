@@ -50,14 +50,19 @@ _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
 class _Watch:
-    """Tells of sweeps, and asks whether to stop; `ended`: the last answer was yes. `fits`: trials of one follow."""
+    """Tells of sweeps, and asks whether to stop.
+
+    Attributes:
+        ended: the last answer was yes.
+        made: sweeps and steps on voxels so far, without those of trials.
+    """
 
     def __init__(self, control: RunControl, n_views: int, fits: bool = False) -> None:
         usual, refined = PnpDct().trial_sweeps, FINISH_SWEEPS + TRIAL_STEPS
         first, whole = (round(share * DEFAULT_STEPS) + refined if fits else 0 for share in (FIRST_SHARE, 1.0))
         self._planned = usual + first, round(MOST_TRIALS * usual) + first + whole
         self._control, self._n_views = control, n_views
-        self._begin, self._trials, self.ended = control.now(), 0, False
+        self._begin, self._trials, self.made, self.ended = control.now(), 0, 0, False
 
     def asked(self) -> bool:
         self.ended = self._control.stop()
@@ -69,7 +74,11 @@ class _Watch:
         self._trials += 1
         return self.sweep(self._trials, *sweeps_of_trials(self._trials, *self._planned))
 
-    def sweep(self, number: int, of: int, unit: str = "sweeps on voxels") -> bool:
+    def refined(self, number: int, of: int) -> bool:
+        self.made = number
+        return self.sweep(number, of, "sweeps on voxels")
+
+    def sweep(self, number: int, of: int, unit: str) -> bool:
         if self._control.on_progress is not None:
             nan, seconds = math.nan, self._control.now() - self._begin
             self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
@@ -267,7 +276,7 @@ class _Finish:
 
 
 class Finished(NamedTuple):
-    """The refined volume, and the sweeps that it took; 0: it is the fit's."""
+    """The refined volume, and the sweeps of total variation that it took; 0: it is the fit's."""
 
     volume: Volume
     sweeps: int
@@ -318,9 +327,9 @@ def finish(
     method = _Finish(count, sweeps is None)
     refined = solve(
         method, projector, data, weight=weights, start=start, nonnegative=nonnegative,
-        watch=Watch(lambda sweep, _: watch.sweep(sweep, method.planned), watch.trial), decide=decide,
+        watch=Watch(lambda sweep, _: watch.refined(sweep, method.planned), watch.trial), decide=decide,
     )  # fmt: skip
-    return Finished(refined, count)
+    return Finished(refined, min(count, watch.made))
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> tuple[F32, F32 | None] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.digest import digest
+from beamline.page.shown_scan import ShownScan
+from beamline.page.tiles import TileRegion
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -136,6 +139,20 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
         assert source.cone is None  # a detector's distance alone is propagation in a parallel beam
         told = replace(PLAIN, cone=(SOD, SDD))
         assert prepare_projections(source, told, _never).geometry.is_cone
+
+
+@pytest.mark.parametrize("row", [19, 24])
+def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path, row: int) -> None:
+    with closing(ShownScan(open_scan(scan))) as shown:
+        assert shown.axis(row) == {"axis": AXIS, "said": "as the file states", "leans": False}
+        tile = shown.fbp(row, AXIS, 0.0, TileRegion(0, 99, 0, 99), fast=False)
+    step = PITCH * SOD / SDD
+    z = (row - (SHAPE[0] - 1) / 2) * step
+    radius = np.sqrt(BALL**2 - (z - CENTRE[2]) ** 2)
+    y, x = ((np.arange(n) - (n - 1) / 2) * step for n in tile.values.shape)
+    inside = np.hypot(x[None] - CENTRE[0], y[:, None] - CENTRE[1]) < radius
+    assert tile.values[inside].mean() == pytest.approx(MU, rel=0.1)
+    assert tile.values.sum() == pytest.approx(MU * inside.sum(), rel=0.1)
 
 
 def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:

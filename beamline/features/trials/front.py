@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from beamline.features.trials import table as pareto
 from beamline.features.trials.figures import cost_curves, pareto_plot
 from beamline.features.trials.layout import TableColumn, TableLayout
-from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
+from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable, steps
 from beamline.features.trials.trial import Outcome
 from beamline.projections.scan_statistics import Light
 from beamline.report.html import Picture
@@ -199,7 +198,7 @@ def conclusions(table: TrialTable) -> list[str]:
         words += f"; the best of all ({best.trial.label}) has {gain:.2f} dB more, for {more} more"
     out = [f"{words}.", *out]
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
-    for stretch in pareto.steps(kept, seconds, qualities):
+    for stretch in steps(kept, seconds, qualities):
         chance = "" if not table.quality.of_views else f" ± {table.chance(stretch.end, stretch.start):.2f}"
         out.append(
             f"+{stretch.gain:.2f}{chance} dB for {_duration(stretch.cost)} more "

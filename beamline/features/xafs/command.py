@@ -245,7 +245,7 @@ def _charge_map(
 
 def _result(title: str, run: SeriesResult) -> XafsResult:
     """The edge of a curve. Raises ScanStopped or DataError, with nothing written, where it has too few energies."""
-    from beamline.features.xafs.edge import LEAST, find_edge
+    from beamline.features.xafs.contrast import LEAST, find_edge
     from beamline.features.xafs.results import XafsResult, left_out
 
     n, lost = run.curve.energies.size, run.curve.left_out

@@ -60,8 +60,7 @@ def run_job(
     job: CurveJob, given: CurveOptions, several: bool, sink: Sink, stop: StopRequest
 ) -> tuple[SeriesResult, str]:
     """The curve of a job and its name; a name tells one of several jobs from the others."""
-    from beamline.features.xafs.contrast import XafsCurve
-    from beamline.features.xafs.edge import LEAST
+    from beamline.features.xafs.contrast import LEAST, XafsCurve
     from beamline.features.xafs.measured import FileOptions, open_series
     from beamline.features.xafs.series import SeriesResult, run_series
 
@@ -107,7 +106,7 @@ def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.floa
     """Energies from low to high, keV. Raises UsageError: a limit is missing, or energies are too few or many."""
     import numpy as np
 
-    from beamline.features.xafs.edge import LEAST
+    from beamline.features.xafs.contrast import LEAST
 
     if low is None or high is None:
         raise click.UsageError("A scene needs a range of energies: --from 8.30 --to 8.42, in keV.")

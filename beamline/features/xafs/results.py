@@ -1,4 +1,8 @@
-"""Results: an energy scan's result as sentences, as a table and as a picture."""
+"""Results: an energy scan's result as sentences, as a table and as a picture, and the tabulated edges near it.
+
+Tabulated edges are those of free atoms in xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). Compounds lie
+a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 eV above the K edge of nickel.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamline.core.files import refuse_existing, write_whole
-from beamline.features.xafs.contrast import XafsCurve
-from beamline.features.xafs.edge import AbsorptionEdge
+from beamline.features.xafs.contrast import AbsorptionEdge, XafsCurve
 from beamline.report.figures import WIDTH, new_figure, png
 from recon.prep.matter import HEAVIEST, TabulatedEdge, edges_of
 

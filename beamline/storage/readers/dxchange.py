@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, Used, frame_indices
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.readers.stacks import FrameStack, StacksSource, TurnedFrames, dimensions
 from beamline.storage.readers.stated import (
     EXCHANGE,
     EXCHANGE_ENERGY_UNITS,
@@ -25,7 +25,6 @@ from beamline.storage.readers.stated import (
     not_used,
     unknown_fields,
 )
-from beamline.storage.readers.turned import TurnedFrames, dimensions
 from drivers.base.frame import FrameKind
 
 _USUAL = (0, 1, 2)

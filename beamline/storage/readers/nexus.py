@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.turned import dimensions
+from beamline.storage.readers.stacks import dimensions
 
 _LISTED = 6  # detectors that an error names
 

@@ -77,6 +77,9 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
         elif field.units is not None and unit.lower() not in field.units and _true(value, item, source):
             why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
             unused.append(NotUsed(field.where, _text(value, unit), why, True))
+        elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
+            why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
+            unused.append(NotUsed(field.where, _text(value, unit), why, True))
     return tuple(unused)
 
 

@@ -16,9 +16,10 @@ from beamline.storage.rules.exposures import EXPOSURE_TOLERANCE, usual_exposure,
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.references import (
     ReferenceGroups,
+    cells_of,
     exposures_of,
     groups_taken,
-    reference_frame,
+    mean_cells,
     reference_groups,
     some_of,
 )
@@ -122,7 +123,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     if not (groups.darks and groups.flats):
         return
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
-    dark, flat = _mean(source, of_darks), _mean(source, of_flats)
+    dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
     if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
         yield Finding(
             "warning",
@@ -136,7 +137,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     light = float(np.percentile((flat - dark)[lit], BRIGHT))
     limit = max(LIT * light, BLOCK_SIGMAS * noise_of(dark))
     views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
-    under = [(dark - view)[lit] for row in views.tolist() if (view := reference_frame(source, row).cells) is not None]
+    under = [(dark - view)[lit] for view in cells_of(source, views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
@@ -158,7 +159,7 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
     """Sentences on possible causes of a factor between views and flats."""
     views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     flats = np.concatenate(groups.flats)
-    seen, flat, dark = (_mean(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
+    seen, flat, dark = (mean_cells(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
     lit = lit_places(flat - dark)
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
@@ -181,12 +182,6 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
     else:
         sentences.append("No exposure is stated for both: flats that were exposed for another time differ so.")
     return " ".join(sentences)
-
-
-def _mean(source: ScanSource, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Cells of the mean of frames."""
-    cells = [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
-    return np.asarray(np.nan_to_num(np.mean(cells, axis=0)), np.float32)
 
 
 def _multiple(source: ScanSource, rows: NDArray[np.int64]) -> int:

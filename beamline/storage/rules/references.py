@@ -254,18 +254,26 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if not (flats.size and darks.size and views_differ(source)):
         return source.exposures
-    dark, light = (
-        np.mean([reference_frame(source, row).cells for row in rows.tolist()], axis=0) for rows in (darks, flats)
-    )
+    dark, light = (mean_cells(source, rows) for rows in (darks, flats))
     lit = lit_places(light - dark)
-    seen = [reference_frame(source, row).cells for row in some_of(views, VIEWS).tolist()]
-    shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if cells is not None]
-    most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if lit.any() else 0.0
+    seen = [mean_cells(source, row) for row in some_of(views, VIEWS)[:, None]]
+    shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
+    most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
     of_views = source.exposures[views]
     for each in (of_views.max(), np.median(of_views), of_views.min()):
         if each <= (1 + _BRIGHTER) * most:
             return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
     return source.exposures
+
+
+def mean_cells(source: ScanSource, rows: Frames) -> NDArray[np.float32]:
+    """Cells of the mean of frames."""
+    return np.asarray(np.nan_to_num(np.mean(cells_of(source, rows), axis=0)), np.float32)
+
+
+def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:
+    """Cells of each of some frames."""
+    return [frame.cells for row in rows.tolist() if (frame := reference_frame(source, row)).cells is not None]
 
 
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:

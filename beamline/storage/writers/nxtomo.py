@@ -29,8 +29,7 @@ from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import LockFailure, WriterLock, lock_failure, no_locks_sentence
 from beamline.storage.writers import layout
-from beamline.storage.writers.ending import STATUSES, ScanEnding, state_ending, state_words
-from beamline.storage.writers.exchange_view import with_exchange_view
+from beamline.storage.writers.ending import STATUSES, ScanEnding, state_ending, state_words, with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.rows import Record, Rows
 from beamline.storage.writers.to_disk import ToDisk

@@ -23,8 +23,7 @@ from drivers.stages.pi_gcs.line import (
     meaning,
     plain,
 )
-from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.pi_gcs.train import TriggerWindow
+from drivers.stages.pi_gcs.settings import PiGcsSettings, TriggerWindow
 from drivers.stages.shared import while_it_moves
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"

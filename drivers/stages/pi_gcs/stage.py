@@ -17,8 +17,7 @@ from drivers.base.protocols import TriggerTrain
 from drivers.stages.kept import SettingsStore
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.line import EVENTS, MOTION, STOPPED, GcsLine, GcsOutput, advice, meaning
-from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
-from drivers.stages.pi_gcs.train import is_spent_by, window_of
+from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings, is_spent_by, window_of
 from drivers.stages.shared import POLL, LineStage, Stops, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
 

@@ -13,7 +13,7 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.stages.kept import FoundSettings
 from drivers.stages.pm16c.line import PM16CLine
-from drivers.stages.pm16c.train import TriggerPoints
+from drivers.stages.pm16c.settings import TriggerPoints
 from drivers.stages.settings import Wiring
 from drivers.stages.shared import while_it_moves
 

@@ -14,8 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, TriggerTrain
 from drivers.stages.kept import SettingsStore
 from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
-from drivers.stages.pm16c.settings import PM16CSettings
-from drivers.stages.pm16c.train import MODES, points_of
+from drivers.stages.pm16c.settings import MODES, PM16CSettings, points_of
 from drivers.stages.shared import LineStage, Stops, found_at_opening, until_standing
 from drivers.stages.travel import Travel
 

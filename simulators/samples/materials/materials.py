@@ -3,6 +3,17 @@
 Cross sections, edges and level widths are those of xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011): the
 total mass attenuation, photoelectric and both kinds of scattering, from 0.1 to 800 keV. This module is imported only
 if a scene names a material.
+
+The K edge of a transition metal in an oxide has its white line in place of the tables' bare step. Tables of free atoms
+have a step; a solid has a rise as wide as the core-hole level (Campbell & Papp, At. Data Nucl. Data Tables 77, 1, 2001,
+included in xraylib: Mn 1.11, Co 1.28, Ni 1.39 eV) and, in an oxide, a line of bound final states above it. The usual
+form of both is
+
+    f(E) = 1/2 + arctan((E - E_step) / (Γ/2)) / π + h / (1 + ((E - E_line) / (γ/2))²)        (Teo, EXAFS, 1986, ch. 2)
+
+The attenuation is that of the other electrons plus f times the jump. Power laws continue both through the edge.
+Oxidation moves E_step and E_line up. Between 60 and 150 eV from the edge this form is blended into the table,
+which holds beyond. The jump of the edge is the table's.
 """
 
 from __future__ import annotations

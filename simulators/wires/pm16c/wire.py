@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Self, TypeVar
 
 from drivers.base.clock import Clock
-from drivers.stages.pm16c.settings import PM16CSettings
-from drivers.stages.pm16c.train import Pm16cFirstPulse
+from drivers.stages.pm16c.settings import Pm16cFirstPulse, PM16CSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.box import WIDTHS, BoxBuild, PM16CBox, Pm16cError, Refused
 

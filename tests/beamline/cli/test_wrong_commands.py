@@ -13,7 +13,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 CASES = {
     "a scan for a configuration": (["scan", "scan.h5", "--dry-run"], 2, ["not a configuration", "beamline info"]),
-    "a scan to view": (["view", "scan.h5"], 5, ["is a scan", "beamline recon scan.h5"]),
+    "a scan to watch": (["watch", "scan.h5"], 5, ["not written by `beamline scan`", "beamline view scan.h5"]),
+    "a scan beside a volume": (["view", "scan.h5", "volume.npz"], 2, ["is a scan, which is shown alone"]),
     "a scan to export": (["export", "scan.h5", "-o", "s.tif"], 5, ["is a scan", "beamline recon scan.h5"]),
     "a volume of Python": (["recon", "volume.npz"], 5, ["saved by Python", "beamline view"]),
     "NIfTI": (["export", "volume.npz", "-o", "v.nii.gz"], 2, ["NIfTI is read, not written", ".nrrd"]),

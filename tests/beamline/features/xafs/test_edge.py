@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from beamline.features.xafs.edge import LEAST, _step, find_edge
+from beamline.features.xafs.contrast import LEAST, _step, find_edge
 
 Reals = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from beamline.core.errors import ConfigError
-from beamline.features.xafs.edge import find_edge
+from beamline.features.xafs.contrast import find_edge
 from beamline.features.xafs.energy_scan import open_energy_scan
 from beamline.features.xafs.series import run_series
 from drivers.base.clock import SystemClock

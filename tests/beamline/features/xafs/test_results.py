@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.xafs.contrast import XafsCurve
-from beamline.features.xafs.edge import AbsorptionEdge
+from beamline.features.xafs.contrast import AbsorptionEdge, XafsCurve
 from beamline.features.xafs.results import XafsResult, lines, refuse_existing_results, table, write
 
 pytestmark = pytest.mark.usefixtures("real_pictures")

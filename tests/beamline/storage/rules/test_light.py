@@ -104,12 +104,15 @@ def test_flats_that_end_at_one_count_everywhere() -> None:
     assert "every pixel of them holds 2500, though" in told(darks, np.minimum(flats, 2500), np.minimum(views, 2500))
 
 
-def test_a_step_of_the_light_where_the_sample_fills_the_field() -> None:
+def test_a_step_and_turns_of_the_light_where_the_sample_fills_the_field() -> None:
     darks, flats, views = counts(60.0)
     views[20:] = (views[20:] - 100) * 0.7 + 100
-    assert "From frame 29 to frame 30 the line integrals of the whole view change by +0.36 at once" in told(
+    assert "Frames 10 and 54, half a turn apart, see one and the same matter, but differ by 0.36" in told(
         darks, flats, views
     )
+    darks, flats, views = counts(60.0)
+    views[::2] = (views[::2] - 100) * 0.7 + 100
+    assert "rise and fall in turn by 0.36" in told(darks, flats, views)
 
 
 def test_images_with_dark_and_bright_exchanged() -> None:

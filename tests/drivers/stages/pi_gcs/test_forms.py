@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.line import ANY_NUMBER, EVENTS, NUMBER, REFUSALS, advice, is_rounding_of, meaning, plain
-from drivers.stages.pi_gcs.train import PiFirstPulse, is_spent_by, window_of
+from drivers.stages.pi_gcs.settings import PiFirstPulse, is_spent_by, window_of
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 # bytes

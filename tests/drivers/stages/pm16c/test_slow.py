@@ -6,7 +6,7 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.pm16c.train import Pm16cFirstPulse
+from drivers.stages.pm16c.settings import Pm16cFirstPulse
 from tests.drivers.pm16c_rig import Rig
 
 
