@@ -212,6 +212,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind
     left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
     right.set(xlabel=kind.label(unit), ylabel="share of voxels", yscale="log")
     right.set_title("Values", fontsize=9)
+    right.yaxis.set_major_formatter("{x:g}")  # powers set as formulas take as long as the rest
     right.yaxis.set_minor_formatter(NullFormatter())  # which ticks of a decade to name takes long, and none is named
     for axes in (left, right):
         axes.grid(alpha=0.3)

@@ -199,10 +199,10 @@ class _Orders:
         if np.linalg.matrix_rank(total) < n:
             return np.full(n - 1, np.nan), np.full(n - 1, np.nan), variances
         found, sigma = np.linalg.solve(total, of_all)[:-1], np.sqrt(np.diag(np.linalg.inv(total))[:-1])
-        for axis, n_parts in ((0, bands), (1, len(normal) if alike else 0)):
-            if n_parts > 2:  # without each in turn: bands disagree where the sample moves, orders where it hardens
+        for axis, count in ((0, bands), (1, len(normal) if alike else 0)):
+            if count > 2:  # without each in turn: bands disagree where the sample moves, orders where it hardens
                 without = np.linalg.solve(total - normal.sum(axis), (of_all - right.sum(axis))[..., None])[:, :-1, 0]
-                sigma = np.maximum(sigma, np.sqrt((n_parts - 1) * without.var(axis=0)))
+                sigma = np.maximum(sigma, np.sqrt((count - 1) * without.var(axis=0)))
         return found, sigma, variances
 
 

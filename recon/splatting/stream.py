@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
@@ -45,6 +45,7 @@ _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places al
 _LAST_GROWTH = 0.5  # density control ends at this share of the last round
 _AXIS_ANEW = 0.3  # px; a move of the axis by so much starts the rates anew, a smaller one in part
 _NEW = 0.2  # weight of the newest view in the running mean over views before they were learnt
+_OTHERS = 0.2  # of the norm of views that replace those of a model: with more change it is placed anew
 _BLIND = 100.0  # data so many times larger than the density unit implies show that the first views were empty
 PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
@@ -161,7 +162,8 @@ class StreamingFit:
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
         """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
 
-        The model stays and goes on. With `kept`, the numbers of the views whose data these are, in order, only these
+        The model stays and goes on, unless the views are others by a fifth than those that it was placed by: then it is
+        placed anew. With `kept`, the numbers of the views whose data these are, in order, only these
         count from then on, and the rates start again, because the model has learnt from bad views.
 
         Raises:
@@ -173,14 +175,25 @@ class StreamingFit:
             raise ValueError("there are no views to replace, or none would be left")
         images = arrivals.checked(data, theta, self._template.detector_shape)
         self._angles, self._held_out = theta.tolist(), [self._held_out[view] for view in which]
-        if self._problem is None or self._state is None:
-            self._data = list(images)
+        if self._problem is None or self._state is None or self._others(images, which):
+            self._data, self._problem, self._state = list(images), None, None
+            self._round_views, self._unseen = 0, []
             return
         self._problem = with_projections(replace(self._problem, geometry=self._template.at(theta)), images)
         if kept is not None:
             self._round_views = min(self._round_views, self.n_views)
             self._state.drawn, self._state.mean, self._schedule_step = [], None, self._state.step
             self._unseen = []
+
+    def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
+        """These line integrals differ from those of the model's views `which` by more than a fifth, in squares."""
+        assert self._problem is not None
+        changed = total = 0.0
+        for view, image in zip(which, images, strict=True):
+            before = self._problem.backend.numpy(self._problem.images[view]) * self._problem.scale
+            changed += float(np.square(image - before, dtype=np.float64).sum())
+            total += float(np.square(image, dtype=np.float64).sum())
+        return changed > _OTHERS**2 * total
 
     def replace_newest(self, data: F32) -> None:
         """Replace the line integrals [row, col] of the newest view: its correction has changed.

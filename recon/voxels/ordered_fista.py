@@ -46,11 +46,12 @@ class Subsets:
         count, heaviest = subsets_of(projector.geometry, most, fewest), 0
         views = interleaved(projector, count)
         projectors = [projector] if count == 1 else [projector.subset(some) for some in views]
-        if weight is not None and count > 1:
-            heaviest = int(np.argmax([float(weight[some].sum(dtype=np.float64)) for some in views]))
-            weight = weight[views[heaviest]]
-        norm = largest_eigenvalue(projectors[heaviest].plain, weight)
-        return cls(views, projectors, 1 / (norm * projectors[heaviest].gain), norm)
+        rays = [None if weight is None else weight[some] for some in views] if count > 1 else [weight]
+        if weight is not None:
+            heaviest = int(np.argmax([0.0 if some is None else float(some.sum(dtype=np.float64)) for some in rays]))
+        norm = largest_eigenvalue(projectors[heaviest].plain, rays[heaviest])
+        gain = max(part.gain(some) for part, some in zip(projectors, rays, strict=True))
+        return cls(views, projectors, 1 / (norm * gain), norm)
 
 
 def ordered_fista(

@@ -39,6 +39,7 @@ _TALL = 0.25  # of the box's height: views that climb by more within the field k
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 _LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
 _MOST_LOOKS = 16
+_STEEP = 1e-8  # of a squared cosine: columns along the rotation axis
 
 
 class _Rays(NamedTuple):
@@ -99,21 +100,24 @@ class Projector:
         """The same without sharpening: no entry of its matrix is negative."""
         return replace(self, matched=False) if self.matched else self
 
-    @property
-    def gain(self) -> float:
-        """A bound of the largest eigenvalue of AᵀA over that of `plain`.
+    def gain(self, weight: F32 | None = None) -> float:
+        """An upper estimate of the largest eigenvalue of AᵀWA over that of `plain`; `weight`: W, of each ray.
 
         Sharpening by s raises the finest detail by 1 + 2 s. Along rows, all views see it. Along columns only views do
-        whose angles differ by less than a voxel at the edge of the field, and all see the largest eigenvector.
+        whose columns differ by less than a voxel at the edge of the field, and all see the largest eigenvector, unless
+        few rays weigh more than the others.
         """
         if self._sharpened is None:
             return 1.0
         cols, rows = ((1 + 2 * max(float(most), 0.0)) ** 2 for most in self._sharpened.max(0))
+        turned = 1 - np.square(np.sin(self.geometry.roll) * np.cos(self.geometry.tilt)).max()  # by a turn of the sample
         angles = np.sort(np.mod(self.geometry.angles, np.pi))
-        turns = np.concatenate((angles, angles + np.pi))
-        alike = np.searchsorted(turns, turns + 2 / self.geometry.detector_shape[1], "right") - np.arange(turns.size)
-        share = min(int(alike.max()) / angles.size, 1.0)
-        return rows * (1 + (cols - 1) * share)
+        turns, alike = np.concatenate((angles, angles + np.pi)), 2 / self.geometry.detector_shape[1]
+        last = np.searchsorted(turns, turns + alike / math.sqrt(max(turned, _STEEP)), "right")
+        share = float((last - np.arange(turns.size)).max()) / angles.size
+        if weight is not None and weight.any():
+            share *= float(weight.max()) * np.count_nonzero(weight) / float(weight.sum(dtype=np.float64))
+        return rows * (1 + (cols - 1) * min(share, 1.0))
 
     def subset(self, views: Sequence[int] | NDArray[np.integer] | slice) -> Projector:
         """The same for some views only, in that order."""

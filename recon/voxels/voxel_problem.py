@@ -135,7 +135,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
         box = replace(grid, shape=(POWER_ROWS, *grid.shape[1:]), centre=centre)
         projector = Projector(some, box, projector.matched)
-    gain, projector = projector.gain, projector.plain
+    gain, projector = projector.gain(weight), projector.plain
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf

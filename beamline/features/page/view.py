@@ -100,7 +100,7 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
         return open_scan(SourceOptions(path, **facts))
     if volume_format(path) is not None:
         return None
-    if hdf5.is_hdf5(path):
+    if path.is_file() and hdf5.is_hdf5(path):
         return None if scan_format(path) is None else open_scan(path)
     try:
         source = open_scan(path)

@@ -391,3 +391,16 @@ def test_another_axis_in_mid_scan_costs_less_than_a_third_of_a_decibel(data: np.
     truth, batches = phantom.attenuation(GRID), np.split(np.arange(40), 40)
     found = {off: _disturbed(data, truth, batches, off) for off in (0.1, 0.3, -0.8)}
     assert min(found.values()) > _disturbed(data, truth, batches) - 0.3, found
+
+
+def test_a_model_of_other_views_is_placed_anew(data: np.ndarray) -> None:
+    model = StreamingFit(VIEWS, GRID, 0, gaussians=500, now=SteppedClock(tick=0.01))
+    shut = data.copy()
+    shut[:8] = 0
+    model.add_views(shut, ANGLES)
+    model.advance(0.1)
+    model.replace_views(data)
+    assert not model.started
+    model.advance(0.1)
+    model.replace_views(np.float32(1.02) * data)
+    assert model.started

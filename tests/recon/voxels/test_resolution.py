@@ -126,21 +126,27 @@ GEOMETRIES = {
     "shifted": Geometry.parallel(np.arange(7) * 0.4, (6, 24), shifts=np.tile((0.2, 0.4), (7, 1))),
     "cone": Geometry.cone(np.arange(12) * np.pi / 6, (24, 24), 2.0, 60.0, 120.0),
     "tilted": Geometry.parallel(np.arange(12) * np.pi / 6, (24, 24), tilt=0.4),
+    "rolled by a quarter turn": Geometry.parallel(np.arange(12) * np.pi / 12, (24, 6), roll=np.pi / 2),
 }
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)
 @pytest.mark.parametrize("voxel", [0.9, 1.0, 1.4])
-def test_the_step_knows_that_the_model_is_sharpened(name: str, voxel: float, rng: np.random.Generator) -> None:
-    geometry = GEOMETRIES[name]
-    projector = Projector(geometry, Grid((6, 24, 24), voxel))
+@pytest.mark.parametrize("others", [1.0, 0.01])
+def test_the_step_knows_that_the_model_is_sharpened(
+    name: str, voxel: float, others: float, rng: np.random.Generator
+) -> None:
+    projector = Projector(GEOMETRIES[name], Grid((6, 24, 24), voxel))
+    views, rows, cols = projector.projection_shape
+    weight = np.full((views, cols, rows), others, np.float32)  # of all views but the first
+    weight[0] = 1
     x = rng.normal(size=(24, 24, 6)).astype(np.float32)
     norm = 0.0
     for _ in range(60):
-        x = projector.adjoint_lines(projector.forward_lines(x))
+        x = projector.adjoint_lines(weight * projector.forward_lines(x))
         norm = float(np.linalg.norm(x))
         x /= norm
-    assert norm <= 1.001 * largest_eigenvalue(projector, None)
+    assert norm <= 1.001 * largest_eigenvalue(projector, weight)
 
 
 @pytest.mark.parametrize("name", GEOMETRIES)

@@ -84,6 +84,11 @@ def test_views_of_any_format_are_slices(name: str, tmp_path: Path) -> None:
 def test_images_that_nothing_calls_a_scan_are_a_volume(tmp_path: Path) -> None:
     path, _ = _pages(tmp_path)
     assert _scan(path, {}) is None
+    (tmp_path / "slices").mkdir()
+    for n, image in enumerate(SCAN.counts()):
+        tifffile.imwrite(tmp_path / "slices" / f"{n:03}.tif", image)
+    assert _scan(tmp_path / "slices", {}) is None
+    assert _scan(tmp_path / "absent.h5", {}) is None
     np.save(tmp_path / "volume.npy", np.ones((3, 4, 5), np.float32))
     assert _scan(tmp_path / "volume.npy", {}) is None
 
