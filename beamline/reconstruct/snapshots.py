@@ -34,7 +34,7 @@ from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
 from recon.prep.correct import Projections
-from recon.splatting.shown import ShownVolume
+from recon.splatting.shown import BetterVolume
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
@@ -110,7 +110,7 @@ class Snapshots:
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 
-    def _method(self, shown: ShownVolume) -> tuple[str, dict[str, float]]:
+    def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
         """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
         fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}

@@ -86,7 +86,7 @@ class PredictionErrors:
 
 
 @dataclass(frozen=True, eq=False)
-class ShownVolume:
+class BetterVolume:
     """The volume of the views so far that predicts views held out best, 1/mm. `direct`: it is FBP's, else the fit's."""
 
     volume: Volume

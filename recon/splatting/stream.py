@@ -37,7 +37,7 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.splatting.shown import PredictionErrors, ShownVolume
+from recon.splatting.shown import PredictionErrors, BetterVolume
 from recon.voxels.field_edges import wider_than_field
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
@@ -304,12 +304,12 @@ class StreamingFit:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
         return fit.volume_of(averaged(self._state), self._grid, self._template, self._settings)
 
-    def shown(self) -> ShownVolume:
+    def shown(self) -> BetterVolume:
         """The volume that predicts views held out better: that of the model, or FBP of the views so far."""
         if self._problem is None or self._state is None:
-            return ShownVolume(self.snapshot(), False, PredictionErrors())
+            return BetterVolume(self.snapshot(), False, PredictionErrors())
         apart = np.flatnonzero(self._held_out).tolist()
-        return ShownVolume.of(averaged(self._state), self._problem, self._settings, self._grid, apart)
+        return BetterVolume.of(averaged(self._state), self._problem, self._settings, self._grid, apart)
 
     @property
     def gaussians(self) -> Gaussians | None:
