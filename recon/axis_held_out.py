@@ -120,9 +120,12 @@ def _search(views: _Views, progress: Callable[[int], None], width: float, near: 
     clear = coarse(best) < (1 - _CLEAR) * typical
     estimate = _vertex(fine, best, half)
     for _ in range(_STEPS):
-        if estimate is None or abs(estimate.axis_col - best) <= half:
+        if estimate is not None and abs(estimate.axis_col - best) <= half:
             break
-        best += half * np.sign(estimate.axis_col - best)
+        downhill = min((best - half, best + half), key=fine)
+        if fine(downhill) >= fine(best):
+            break
+        best = downhill
         estimate = _vertex(fine, best, half)
     if estimate is None:
         return _estimate(best, coarse, confident=False)

@@ -211,7 +211,7 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
 
 def some_of(group: Frames, most: int) -> Frames:
     """At most so many rows, evenly spread."""
-    return group[np.unique(np.linspace(0, group.size - 1, most).astype(int))]
+    return group[np.unique(np.linspace(0, group.size - 1, min(most, group.size)).astype(int))]
 
 
 def _with_unread(source: ScanSource, judged: GroupVerdict, taken: Sequence[Frames]) -> GroupVerdict:

@@ -169,6 +169,7 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
         return Costs({"a": Work.of(CLOCK, slices), "b": Work.of(CLOCK, slices / 2)})
 
     monkeypatch.setattr(estimate, "costs_of", costs)
+    monkeypatch.setattr("beamline.core.machine.busy", lambda: 1.0)
     all_of_it, rest = (
         json.loads(beamline(*FISTA, *more, "--dry-run", "--json").stdout.splitlines()[-1])
         for more in (("-o", "other.h5"), ("-o", "out.h5", "--resume", "out.partial.h5"))
