@@ -45,7 +45,7 @@ _MODULES = {
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.recon_report report.figures",
     "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",
-    "study": "features.trials.study_command features.trials.study features.trials.figures",
+    "study": "features.trials.command features.trials.study features.trials.figures",
 }
 _CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
 
@@ -120,7 +120,7 @@ def main() -> None:
             import_module(f"beamline.{module}")
     runner.run_trial = _made_up
     runner.compile_kernels = lambda *_: None
-    figures.FigureCanvasAgg = BlankCanvas  # type: ignore[misc]
+    figures.canvas = BlankCanvas  # type: ignore[assignment]
     os.chdir(folder)
     out, counted = Path("out"), Path("count")
 

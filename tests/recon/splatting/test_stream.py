@@ -193,9 +193,9 @@ def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.Mo
     first, placements = StreamingFit._place_first, list[bool]()
 
     def quality(knows: bool) -> float:
-        def place(model: StreamingFit, known: fit.FitState | None = None) -> None:
+        def place(model: StreamingFit, known: fit.FitState | None = None, *, all_views: bool) -> None:
             placements.append(known is not None)
-            first(model, known if knows else None)
+            first(model, known if knows else None, all_views=all_views)
 
         monkeypatch.setattr(StreamingFit, "_place_first", place)
         model = StreamingFit(geometry, Grid.matching(geometry), now=SteppedClock(tick=1.0))

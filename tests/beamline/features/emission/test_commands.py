@@ -191,12 +191,12 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     with open_scan(pet) as source:
         prepared = prepare_projections(source, Selection(), pytest.fail)
     assert prepared.emission is not None
-    groups = np.arange(24).reshape(12, 2).tolist()
+    groups = np.arange(24).reshape(12, 2)
     angles = prepared.geometry.angles[groups].mean(axis=1)
     views = replace(prepared.geometry.select(groups[:, 1]), angles=angles)
     data = TrialData(prepared, None)
     settings: dict[str, int] = {"iterations": 2, "subsets": 3}
-    row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups))
+    row = Trial("method", "osem", 12, settings=settings, choice=ViewChoice("pairs", groups.tolist()))
     run(row, data, 0, print, keep=tmp_path / "volume.npy")
     expected = recon.mlem(prepared.emission.summed(groups, views), recon.Grid.matching(views), 2, 3).data
     np.testing.assert_array_equal(np.load(tmp_path / "volume.npy"), expected)

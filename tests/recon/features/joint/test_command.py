@@ -172,6 +172,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     monkeypatch.chdir(tmp_path)
     costs = Costs({"rest": Work.of(CLOCK, 30.0), "moving": Work.of(CLOCK, 70.0)})
     monkeypatch.setattr("recon.features.joint.methods.series_costs", lambda *_: costs)
+    monkeypatch.setattr("beamline.core.machine.busy", lambda: 1.0)
     done = beamline("recon", str(scan), "--time", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
