@@ -12,7 +12,6 @@ from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimu
 
 from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
-from recon.base.splines import spline_through, value_at
 
 NOISE_VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
@@ -154,10 +153,12 @@ def _fine(image: F32) -> F32:
 
 def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
     """Values [..., col] of the columns on the other side of the axis, by cubic splines; NaN where there are none."""
+    from scipy.interpolate import make_interp_spline  # a quarter of a second
+
     cols = values.shape[-1]
-    at = np.asarray(2 * axis_col - np.arange(cols), np.float64)
-    opposite = value_at(spline_through(values), at.reshape((1,) * (values.ndim - 1) + (cols,)))
-    return np.where((at >= 0) & (at <= cols - 1), opposite, np.nan)
+    at = 2 * axis_col - np.arange(cols)
+    spline = make_interp_spline(np.arange(cols), values, 3, axis=-1)
+    return np.where((at >= 0) & (at <= cols - 1), spline(np.clip(at, 0, cols - 1)), np.nan)
 
 
 def without_layers(stripes: F32, axis_col: float) -> F32:

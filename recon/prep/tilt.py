@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F64
-from recon.base.splines import spline_through, value_at
 from recon.prep.align import opposite_curves
 from recon.prep.axis_search import FEWEST_BANDS, FEWEST_COLS
 from recon.prep.axis_wedge import wedge_curves
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 STEEPEST = math.radians(5)  # Largest tilt of the search, radians
 _DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
@@ -99,7 +102,9 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     typical = float(np.median(np.log(curves).sum(axis=0)))
     if abs(slope) == most or not 0 < at < n - 1 or typical - lowest < _DEEP * heights.size:
         raise ValueError("no clear optimum")
-    splines = _Curves(spline_through(curves), float(candidates[0]), step)
+    from scipy.interpolate import CubicSpline  # half a second
+
+    splines = [CubicSpline(candidates, curve) for curve in curves]
     start = np.array([candidates[at], slope * step / far])
     every = np.arange(heights.size)
     line = _descend(splines, heights, every, start)
@@ -112,44 +117,32 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     return TiltEstimate(math.atan(line[1]), spread / (1 + line[1] ** 2), float(line[0]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Curves:
-    """Splines [band] through the curves of mismatches, whose candidates begin at `first` and are `step` apart."""
-
-    splines: F64
-    first: float
-    step: float
-
-    def at(self, bands: NDArray[np.int64], places: F64, derivative: int = 0) -> F64:
-        """The mismatch of some bands with axes [band, place], or its derivative."""
-        value = value_at(self.splines[bands], (places - self.first) / self.step, derivative)
-        return value / self.step**derivative
-
-
-def _scatter(splines: _Curves, heights: F64, line: F64) -> float:
+def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:
     """Standard deviation of the slope from the distances of the bands' own axes to the line (weighted least squares).
 
     A band's weight is the curvature of its logarithm. Few bands may lie at the ends, which determine the slope. The
     scatter is therefore divided by the effective number of bands for the slope, not by their total.
     """
-    at, every = line[0] + line[1] * heights, np.arange(heights.size)
-    value, second = (splines.at(every, at[:, None], order)[:, 0] for order in (0, 2))
+    at = line[0] + line[1] * heights
+    value, second = (np.array([spline(x, order) for spline, x in zip(splines, at, strict=True)]) for order in (0, 2))
     weight = np.maximum(second, 0) / np.maximum(value, _FLOOR)
-    last = splines.first + splines.step * (splines.splines.shape[1] - 1)
-    near = np.clip(at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), splines.first, last)
-    own = near[every, splines.at(every, near).argmin(axis=1)] - at
+    near = at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1)
+    near = np.clip(near, splines[0].x[0], splines[0].x[-1])
+    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - at
     lever = weight * (heights - np.average(heights, weights=weight)) ** 2
     carriers = lever.sum() ** 2 / (lever**2).sum()
     variance = np.average(own**2, weights=weight) * heights.size / (heights.size - 2)
     return math.sqrt(variance / carriers * weight.sum() / lever.sum())
 
 
-def _descend(splines: _Curves, heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
+def _descend(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
     """(axis at height 0, slope) of the least sum of logarithms near `start`, by least squares weighted anew."""
     line, h, far = start.copy(), heights[bands], float(np.abs(heights).max())
     for _ in range(_NEWTON):
         at = line[0] + line[1] * h
-        value, first, second = (splines.at(bands, at[:, None], order)[:, 0] for order in range(3))
+        value, first, second = (
+            np.array([splines[b](x, order) for b, x in zip(bands, at, strict=True)]) for order in range(3)
+        )
         weight = 1 / np.maximum(value, _FLOOR)
         first, second = weight * first, weight * np.maximum(second, 0)  # a band counts only within its own minimum
         bend = np.array([[second.sum(), (h * second).sum()], [(h * second).sum(), (h * h * second).sum()]])
