@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.plan.plan import Block, Mode
 from drivers.base.frame import FrameKind
+from recon.base.views import spread
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 """The golden section; modulo one, its multiples stay spread at every length (three-gap theorem, Sós 1957)."""
@@ -118,11 +119,9 @@ class Retake:
     trigger: int
 
 
-def spread(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
+def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
     """At most so many of the views, evenly spread: gaps between them stay small."""
-    if len(views) <= most:
-        return tuple(views)
-    return tuple(views[i] for i in np.unique(np.linspace(0, len(views) - 1, most).round().astype(int)))
+    return tuple(views[i] for i in spread(np.arange(len(views)), most))
 
 
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
@@ -142,7 +141,7 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
 def return_triggers(views: Block, n: int) -> NDArray[np.int64]:
     """Triggers of `n` views, evenly spread in angle, in the order in which a stage passes them on its way back."""
     ahead = np.argsort(views.angles, kind="stable")
-    chosen = ahead[np.unique(np.linspace(0, views.n - 1, min(n, views.n)).round().astype(int))]
+    chosen = spread(ahead, n)
     back = abs(views.angles[chosen[0]] - views.angles[-1]) > abs(views.angles[chosen[-1]] - views.angles[-1])
     return np.asarray(chosen[::-1] if back else chosen, np.int64)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
-from beamline.plan.angles import Retake, retake_block, return_block, spread
+from beamline.plan.angles import Retake, retake_block, return_block, spread_retakes
 from beamline.plan.limits import PlanFacts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.triggers import Flight, Scale, plan_flight
@@ -247,7 +247,7 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
     """Time of the largest number of repeated views, evenly spread, from the end of the views."""
     if not plan.retakes:
         return 0.0
-    triggers = [retake.trigger for retake in spread([Retake(i, i) for i in range(views.n)], plan.retakes)]
+    triggers = [retake.trigger for retake in spread_retakes([Retake(i, i) for i in range(views.n)], plan.retakes)]
     block = retake_block(views, np.array(triggers, np.int64))
     return block_seconds(block, stage, camera, plan.settle) + _return(views, stage)
 

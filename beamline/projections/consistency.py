@@ -23,6 +23,7 @@ from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.units import look_negative
+from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
 from recon.voxels.view_weights import covers_the_circle
@@ -92,7 +93,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     known = prepared.measured is None and prepared.emission is None and prepared.projections.floored <= _FLOORED
     if not whole or few or not known:
         return {}
-    some = _evenly(len(data), _VIEWS)
+    some = spread(np.arange(len(data)), _VIEWS)
     if cut_sides(data, geometry) or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
@@ -138,7 +139,10 @@ def compare_with_flats(
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
-        columns = [np.median(projections.data[view], axis=0) for view in _evenly(len(projections.data), _COLUMN_VIEWS)]
+        columns = [
+            np.median(projections.data[view], axis=0)
+            for view in spread(np.arange(len(projections.data)), _COLUMN_VIEWS)
+        ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
     found = list(light_beside_flats(source, groups, level, air, accepted or said or not refused))
@@ -148,10 +152,6 @@ def compare_with_flats(
         refuse(source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
-
-
-def _evenly(n: int, most: int) -> NDArray[np.intp]:
-    return np.unique(np.linspace(0, n - 1, min(n, most)).astype(int))
 
 
 def _air_is_off(data: F32, some: NDArray[np.intp]) -> bool:

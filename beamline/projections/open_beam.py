@@ -26,6 +26,7 @@ from beamline.storage.rules.references import ReferenceGroups, groups_taken, ref
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
+from recon.base.views import spread
 from recon.prep.correct import Correction, CorrectionSettings, References
 from recon.prep.counts import Photons
 from recon.prep.defects import SHADOW_REACH, shadowed
@@ -120,7 +121,7 @@ class OpenBeam:
             return None
         references, settings = replace(self.references, dynamic=None), replace(self.settings, air="none")
         in_shadow = np.zeros(references.dark.shape, np.bool_)
-        views = views[np.linspace(0, views.size - 1, min(views.size, _SHADOW_VIEWS)).astype(int)]
+        views = spread(views, _SHADOW_VIEWS)
         for start in range(0, len(in_shadow), _BAND):
             rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * binning, first + rows.stop * binning)

@@ -28,6 +28,7 @@ from beamline.storage.rules.scan import altered_sentence
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
+from recon.base.views import spread
 
 BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
 SAMPLES = 4  # frames of a kind that tell where the detector saturates
@@ -291,7 +292,7 @@ def _saturation(source: ScanSource) -> float:
         return stated
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
-        for row in rows[np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))] if rows.size else ():
+        for row in spread(rows, SAMPLES):
             image = read_known(source, [int(row)])[0]
             largest = float(image.max())
             if largest == full_scale(largest) and (image == image.max()).mean() > PILED_UP:

@@ -13,6 +13,7 @@ from beamline.core.errors import ConfigError
 from beamline.report.figures import one_panel, png
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
+from recon.base.views import spread
 from recon.prep.matter import absorbed_dose
 
 FRAMES = 64  # Frames of a kind that are looked at, spread evenly over all of them
@@ -57,7 +58,7 @@ def statistics_of(
     for kind in kinds:
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
-            chosen[kind] = rows[np.unique(np.linspace(0, rows.size - 1, FRAMES).round().astype(int))], rows.size
+            chosen[kind] = spread(rows, FRAMES), rows.size
     total, done = 2 * sum(rows.size for rows, _ in chosen.values()), 0
 
     def image(row: int) -> NDArray[Any]:

@@ -19,6 +19,7 @@ from beamline.storage.volumes.files import opened_volume, whole_volume
 from recon.assess import metrics
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
@@ -218,7 +219,7 @@ def squares_left(
 
 def _views_compared(geometry: Geometry) -> NDArray[np.int64]:
     n = geometry.n_views
-    return np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
+    return spread(np.arange(n), _RESIDUAL_VIEWS)
 
 
 def _residual(

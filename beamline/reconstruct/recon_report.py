@@ -19,6 +19,7 @@ from beamline.report.slice_sheet import SliceSheet
 from beamline.report.time_curves import quality_against_time
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.methods import BASELINE
 from recon.voxels.unexplained import LIMIT, Unexplained
@@ -217,7 +218,7 @@ def _several(series: VolumeSeries) -> list[Picture]:
         else ("time", "times in one grey window: what differs has changed or moved.")
     )
     n, depth = series.data.shape[:2]
-    some = np.unique(np.linspace(0, n - 1, min(n, _SHOWN)).round().astype(int))
+    some = spread(np.arange(n), _SHOWN)
     pictures = []
     for title, turned in ((f"Slices of each {of}", False), (f"Upright slices of each {of}", True)):
         if turned and depth < _UPRIGHT:

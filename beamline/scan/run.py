@@ -33,7 +33,7 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
-from beamline.plan.angles import Retake, spread
+from beamline.plan.angles import Retake, spread_retakes
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.control import verbs_taken
@@ -433,7 +433,7 @@ class _Run:
             return ()
         lost = [Retake(-1, trigger) for trigger in missing]
         bad = sorted([*recorder.views_to_retake, *lost], key=lambda view: view.trigger)
-        chosen = spread(bad, most)
+        chosen = spread_retakes(bad, most)
         if not chosen:
             return ()
         if len(chosen) < len(bad):

@@ -18,6 +18,7 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.masks import masked
 from recon.base.ray_model import RayModel
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
@@ -301,7 +302,7 @@ def scale_to_data(
     Projection is linear in density, so this is the exact least-squares factor. It replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
-    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(SCALED_BY, geometry.n_views)).round().astype(int))
+    chosen = spread(np.arange(geometry.n_views), SCALED_BY)
     rendered = project(gaussians, geometry, chosen.tolist(), model=rays).numpy()
     measured = np.asarray(projections[chosen], np.float64)
     power = float((rendered.astype(np.float64) ** 2).sum())

@@ -10,6 +10,7 @@ import numpy as np
 from recon.base.arrays import F32
 from recon.base.empirical import EMPTY
 from recon.base.geometry import Geometry
+from recon.base.views import spread
 from recon.voxels.view_weights import covers_the_circle
 
 LEAST = 0.1
@@ -46,7 +47,7 @@ class FieldEdges:
         width = max(2, cols // 50)
         if n == 0 or cols < 2 * width:
             return cls({}, 0.0)
-        views = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))
+        views = spread(np.arange(n), _VIEWS)
         some = data[np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))]
         some = np.where(np.isfinite(some), some, np.nan)
         mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)

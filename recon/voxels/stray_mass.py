@@ -12,6 +12,7 @@ from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, masked
 from recon.base.noise import noise_level
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector
 
@@ -118,7 +119,7 @@ def _empty_and_seen(
     projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None
 ) -> tuple[Mask, Mask]:
     """As `seen_empty`, and the voxels that are on the detector in all of these views, [z, y, x] each."""
-    some = np.unique(np.linspace(0, geometry.n_views - 1, min(geometry.n_views, _VIEWS)).round().astype(np.intp))
+    some = spread(np.arange(geometry.n_views), _VIEWS)
     data, known = masked(projections[some], None if weights is None else weights[some])
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur
     limit = max(_SIGMAS * noise, _LEAST * float(np.percentile(data, 99)))

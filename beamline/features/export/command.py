@@ -35,6 +35,7 @@ from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock
+from recon.base.views import spread
 
 if TYPE_CHECKING:
     from beamline.features.export.film_file import FilmImages, FilmStyle, WrittenFilm
@@ -295,7 +296,7 @@ def _suggestion(record: ReconRecord) -> str:
     import numpy as np
 
     depth = record.volume.grid.shape[0]
-    chosen = np.unique(np.linspace(0, depth - 1, min(depth, _SLICES)).astype(int))
+    chosen = spread(np.arange(depth), _SLICES)
     some = [np.ravel(np.asarray(record.volume.data[z : z + 1], np.float32)) for z in chosen.tolist()]
     values = np.concatenate([values[:: max(1, values.size // _VALUES)] for values in some])
     values = values[np.isfinite(values)]

@@ -24,6 +24,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.recon_record import ReconRecord
 from drivers.base.frame import FrameKind
 from recon.base.greys import matter_window
+from recon.base.views import spread
 
 F32 = NDArray[np.float32]
 MOST_IMAGES = 600  # of a film: of more slices or views every second, third ... is shown
@@ -106,7 +107,7 @@ def slices_along(record: ReconRecord, axis: int, side: int) -> FilmImages:
 
     width = grid.shape[3 - axis] if axis else grid.shape[2]
     cols = min(width, side)
-    looked_at = np.unique(np.linspace(0, grid.shape[0] - 1, _LOOKED_AT).astype(int)).tolist()
+    looked_at = spread(np.arange(grid.shape[0]), _LOOKED_AT).tolist()
     return FilmImages(
         shown=shown,
         read=across if axis else lambda: map(slice_at, shown),
@@ -264,7 +265,7 @@ def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
         if unusable is not None and not given:
             raise unusable
 
-    few = [shown[i] for i in np.unique(np.linspace(0, len(shown) - 1, _LOOKED_AT_VIEWS).astype(int))]
+    few = spread(np.asarray(shown), _LOOKED_AT_VIEWS).tolist()
     height, width = source.row_pitch_mm, source.pixel_size_mm
     ratio = 1.0 if height is None or width is None else height / width
     return FilmImages(shown, lambda: images(shown), lambda: images(few), ratio)

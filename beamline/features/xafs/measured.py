@@ -24,6 +24,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_transmission
+from recon.base.views import spread
 
 _MOST_VIEWS = 32  # evenly spread: more say little more of a region, and take long to read
 Reals = NDArray[np.float64]
@@ -83,7 +84,7 @@ def _all(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
 
 def _chosen(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
     frames = _all(source, kind)
-    return frames[np.unique(np.linspace(0, frames.size - 1, _MOST_VIEWS).round().astype(int))]
+    return spread(frames, _MOST_VIEWS)
 
 
 def _frame(source: ScanSource, index: int, part: FramePart) -> Reals:
@@ -232,7 +233,7 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
             raise DataError(f"{path}: frames are {frames.shape}; they must be [energy, row, col] of {energies.size}.")
         if quantity == "line_integrals":
             flats = None
-            some = frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int)).tolist()]
+            some = frames[spread(np.arange(len(frames)), _LOOKED_AT).tolist()]
             if look_like_transmission(np.asarray(some, np.float32)):
                 raise DataError(
                     f"{path}: frames are about 1 at their edges and fall where the material is, as transmission does; "

@@ -11,6 +11,7 @@ from beamline.storage.readers.base import WHOLE, Attributes, NotUsed, ScanSource
 from beamline.storage.readers.wrapped import UNPACKED, WrappedSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
+from recon.base.views import spread
 
 _LOOKED_AT = 3  # frames of a kind
 _SATURATED = 1e-3  # of the pixels, from which light, and no gap, is at the end of a type; as the limit of flats
@@ -74,7 +75,7 @@ def _ends(source: ScanSource) -> list[Mask]:
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
-        for row in np.unique(rows[np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int)]) if rows.size else ():
+        for row in spread(rows, _LOOKED_AT):
             ends.append(_end_in(source, int(row)))
             if not ends[-1].any():
                 return []

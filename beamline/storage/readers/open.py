@@ -37,6 +37,7 @@ from beamline.storage.readers.wrapped import (
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
 from recon.base.registry import Registry, in_folders
+from recon.base.views import spread
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -261,7 +262,7 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
-            some = rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))]
+            some = spread(rows, _LOOKED_AT)
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
             yield read_known(source, some[:1] if every > 1 else some, slice(None, None, every))
 

@@ -24,6 +24,7 @@ from recon.base.arrays import F32, F64, Mask, median_deviation
 from recon.base.binning import bin_views, factor_within
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.vectors import dot
 from recon.prep.background import LEAST_SIZE, coordinate, powers
@@ -162,7 +163,7 @@ class _Views:
     def of(cls, projections: F32, geometry: Geometry, times: F64, measured: Mask | None) -> _Views:
         shape, n = geometry.detector_shape, geometry.n_views
         factor = factor_within(shape, _VOXELS)
-        some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
+        some = spread(np.arange(n), _VIEWS)
         data = np.concatenate([bin_views(projections[k : k + 1], factor) for k in some])
         views, weight = geometry.select(some).binned(factor), None
         if measured is not None and not measured.all():

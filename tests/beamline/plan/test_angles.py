@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.plan import angles
-from beamline.plan.angles import Retake, middle_of_exposure, retake_block, spread
+from beamline.plan.angles import Retake, middle_of_exposure, retake_block, spread_retakes
 from beamline.plan.plan import Mode
 from beamline.plan.timeline import work_out
 from drivers.base.frame import FrameKind
@@ -151,7 +151,7 @@ def test_no_views_is_refused(plan: object) -> None:
 @given(st.integers(1, 200), st.integers(1, 60))
 def test_the_choice_is_bounded_even_and_in_order(n: int, most: int) -> None:
     views = [Retake(10 + i, i) for i in range(n)]
-    chosen = [view.trigger for view in spread(views, most)]
+    chosen = [view.trigger for view in spread_retakes(views, most)]
     assert len(chosen) == min(n, most)
     assert chosen == sorted(set(chosen)) and set(chosen) <= set(range(n))
     if most > 1:
