@@ -46,7 +46,7 @@ _LAST_GROWTH = 0.5  # density control ends at this share of the last round
 _AXIS_ANEW = 0.3  # px; a move of the axis by so much starts the rates anew, a smaller one in part
 _NEW = 0.2  # weight of the newest view in the running mean over views before they were learnt
 _OTHERS = 0.2  # of the norm of views that replace those of a model: with more change it is placed anew
-# Without: -0.4 to -13.5 dB on three scenes (texture, plates, points) whose first 3 to 16 of 48 views were empty at first.
+# Without: -0.4 to -13.5 dB on three scenes (texture, plates, points) whose first 3 to 16 of 48 views were empty.
 _BLIND = 100.0  # data so many times larger than the density unit implies show that the first views were empty
 PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
