@@ -29,8 +29,8 @@ from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.truncation import cut_sentence, cut_sides
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import ViewGeometry
-from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.changed import JOINED_DEG
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked

@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
-from beamline.storage.scratch import scratch_array
+from beamline.storage.disk_file import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of

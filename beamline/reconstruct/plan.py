@@ -43,9 +43,9 @@ from beamline.reconstruct.options import (
 )
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.workers import cluster
+from beamline.storage.disk_file import scratch_array
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.angle_table import assign, evenly_spaced_window, load_angles, parse_angles, select_rows
 from beamline.storage.readers.stacks import StacksSource
+from beamline.storage.readers.supplied import assign, evenly_spaced_window, load_angles, parse_angles, select_rows
 
 KEY = [2, 1, 0, 0, 0, 1, -1]
 

@@ -12,7 +12,7 @@ import tifffile
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.reference_files import load_images
+from beamline.storage.readers.supplied import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)

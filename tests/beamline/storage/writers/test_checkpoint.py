@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from beamline.core.errors import DataError
-from beamline.storage.writers import checkpoint as checkpoint_file
-from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from beamline.storage.writers import recon_file as checkpoint_file
+from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 
 KEPT = Checkpoint(
     {"parameters.raw": np.arange(4, dtype=np.float32), "generator": np.array([2**64 - 1, 3], np.uint64)},
