@@ -20,8 +20,7 @@ from recon.methods import with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import IterativeMethod, Watch, solve
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.registry import in_folders
 from recon.base.volume import Grid, Volume
-from recon.base.work import Rate
+from recon.base.work import Rate, SizedRun
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.patches import denoise, patch_scratch
 from recon.kernels.cpu.vectors import add_product
@@ -32,20 +31,11 @@ from recon.splatting.splat import voxelize
 from recon.splatting.work import covered
 from recon.voxels.direct import direct, direct_work
 from recon.voxels.projector import Projector
-from recon.voxels.sweeps import Sweeps
-from recon.voxels.tv import TotalVariationProx
+from recon.voxels.voxel_problem import Sweeps, TotalVariationProx
 
 _TV_STEPS = 3
 _SERIAL = ("draw",)  # operations of one thread
 RUNS = 3  # the quickest counts; one more comes first, and loads the code and the data
-
-
-class SizedRun(NamedTuple):
-    """An operation of some size: the two amounts of its work, and what does it."""
-
-    first: float
-    second: float
-    run: Callable[[], object]
 
 
 def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:

@@ -20,8 +20,7 @@ from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
-from recon.prep.counts import Counts, line_integrals
-from recon.prep.emission import Emission, weighted_lines
+from recon.prep.counts import Counts, Emission, line_integrals, weighted_lines
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -39,9 +39,8 @@ from recon.base.method import (
     RunControl,
     candidates_of,
 )
-from recon.base.slabs import Slab
 from recon.base.stop import Stop
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Slab
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.last_round import LastRound

@@ -34,10 +34,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F64
-from recon.base.declared_types import check_arguments
-from recon.base.picture import fan, html
+from recon.base.declared_types import check_arguments, check_settings
+from recon.base.greys import fan, html
 from recon.base.ray_width import NO_WIDTH, RayWidth
-from recon.base.settings_check import check_settings
 
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only

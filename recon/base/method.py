@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.picture import html, middle_slices
-from recon.base.settings_check import check_settings
+from recon.base.greys import html, middle_slices
 from recon.base.stop import Stop
 from recon.base.volume import Grid, Volume, VolumeSeries
 

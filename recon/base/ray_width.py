@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from recon.base.settings_check import check_settings
+from recon.base.declared_types import check_settings
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
+from recon.base.declared_types import check_settings
 from recon.base.empirical import APART, GROWTH, LOST
-from recon.base.settings_check import check_settings
 
 _PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 

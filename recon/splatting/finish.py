@@ -28,10 +28,8 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.held_out import MOST_TRIALS, HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
-from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
+from recon.voxels.methods import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 

@@ -16,10 +16,10 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
-from recon.voxels.methods.pnp_dct import PnpDct
-from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.methods import PnpDct
+from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
 """Largest share of the finish in the time after the first steps: it adds more than most steps before it."""

@@ -8,8 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, bin_views
 from recon.base.choices import Loss as Loss
 from recon.base.geometry import Geometry
 from recon.base.masks import masked

@@ -12,10 +12,10 @@ import numpy as np
 from recon.assess.plans import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
+from recon.base.declared_types import check_settings
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
@@ -27,7 +27,7 @@ from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.splatting.work import fit_costs
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50

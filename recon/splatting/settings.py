@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 from recon.base.choices import KERNEL
+from recon.base.declared_types import check_settings
 from recon.base.empirical import (
     DEFAULT_STEPS,
     NARROWEST,
@@ -19,7 +20,6 @@ from recon.base.empirical import (
 )
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss

@@ -49,8 +49,7 @@ from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_
 from recon.splatting.splat import voxel_means
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import UNITS
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import data_residual
 
 _ON_VOXELS = FistaTv, PnpDct  # candidates that a fit is compared with, the simpler one first

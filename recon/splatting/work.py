@@ -15,10 +15,8 @@ from recon.splatting.initialise import SCALED_BY, count_for, joined_for, start_m
 from recon.splatting.settings import FitSettings, growth
 from recon.voxels.direct import direct_work
 from recon.voxels.held_out import LEAST_VIEWS
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
-from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.pnp_dct import TRIAL_STEPS
+from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.priors import TRIAL_STEPS, subsets_of
 from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient

@@ -13,10 +13,10 @@ from numba import njit, prange
 from scipy import fft
 
 from recon.base.arrays import F32, F64
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS

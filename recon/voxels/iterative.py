@@ -35,7 +35,7 @@ _SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait
 
 @runtime_checkable
 class IterativeMethod(Protocol):
-    """An iterative method on voxels, such as `recon.features.iterative.sirt.Sirt`."""
+    """An iterative method on voxels, such as `recon.features.iterative.methods.Sirt`."""
 
     @property
     def iterations(self) -> int: ...

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import recon
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES, QualityCurve
-from recon.base.binning import bin_views
+from recon.base.arrays import bin_views
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume

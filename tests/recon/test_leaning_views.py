@@ -9,10 +9,9 @@ import pytest
 
 import recon
 from recon import methods
-from recon.auto import Auto
+from recon.auto import Auto, part_of
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
-from recon.trials import part_of
 from recon.voxels.odd_views import odd_views
 from recon.voxels.projector import Projector, data_residual, seen_rays
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball

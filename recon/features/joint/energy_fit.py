@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector, projection_lines
-from recon.voxels.tv import TotalVariationProx, difference_weights
-from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
+from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
 _ROUNDS = 6  # of power iteration

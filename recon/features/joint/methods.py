@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.base.work import Costs, Work
-from recon.features.joint.energy_fit import EnergyViews
-from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS
-from recon.features.joint.series import SWEEPS, TimedViews, fit_series, series_costs
-from recon.features.joint.share_fit import STEPS, fit_share
+from recon.base.work import Costs, SizedRun, Work
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews
+from recon.features.joint.motion import Motion
+from recon.features.joint.proportions import SOLUTION_STEPS, STEPS, TRIAL_STEPS, fit_share
+from recon.features.joint.series import MOMENTS, SWEEPS, TimedViews, fit_series, of_moments, series_costs
 from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
@@ -278,3 +279,28 @@ def _because(still: float, moved: float, moves: bool) -> str:
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"
     return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+
+
+def timed(which: str) -> tuple[SizedRun, ...]:
+    """Sweeps of so many volumes, as of "moving 3"."""
+    from recon.machine_speed import views_of_disc
+
+    kind, count = which.split()
+    volumes, sized = int(count), list[SizedRun]()
+    for cols in (32, 80):
+        geometry, grid, data = views_of_disc("parallel", 16, cols, 12 * volumes)
+        n, motion = geometry.n_views, None
+        if kind == "energies":
+            views = EnergyViews(data, geometry, np.arange(n) * volumes // n, np.eye(volumes) + 0.5)
+        else:
+            times, (nz, ny, nx) = np.arange(n, dtype=np.float64), grid.shape
+            knots = np.linspace(0, times[-1], volumes)
+            views, past = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
+            motion = Motion.none((ny, nx, nz), past, 3, 3) if kind == "moving" else None
+        fit = EnergyFit(views, grid, np.random.default_rng(0), motion)
+        sized.append(SizedRun(n, n * math.prod(grid.shape), partial(_sweep, fit, volumes)))
+    return tuple(sized)
+
+
+def _sweep(fit: EnergyFit, volumes: int) -> None:
+    list(fit.sweeps(np.full(volumes, 0.1), 1))

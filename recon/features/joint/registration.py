@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F64
-from recon.base.binning import bin_views
+from recon.base.arrays import F64, bin_views
 from recon.base.declared_types import check_arguments
 from recon.features.joint.energy_fit import EnergyViews
 from recon.voxels.displacement import Displacement, displaced, displacements, judge, measured_unmagnified, unmagnified

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
-from recon.base.declared_types import check_arguments
+from recon.base.declared_types import check_arguments, check_settings
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work

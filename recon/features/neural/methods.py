@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Any, ClassVar
 
-from recon.base.settings_check import check_settings
+from recon.base.declared_types import check_settings
 from recon.features.neural.networks import Field, HashGrid, Waves
 from recon.features.neural.train import FieldMethod
+from recon.base.work import SizedRun
+from recon.methods import by_name, with_settings
+from recon.reconstruction import reconstruct
 
 _COARSEST = 16  # cubes an edge of the first level
 
@@ -106,3 +110,17 @@ class IntraTomo(FieldMethod):
     def network(self, across: int) -> Field:
         highest = None if self.allow_negative else self.highest
         return Field(Waves(self.bands), self.width, waves=True, attention=False, highest=highest)
+
+
+def timed(which: str) -> tuple[SizedRun, ...]:
+    """Steps of the method of this name."""
+    from recon.machine_speed import views_of_disc
+
+    geometry, grid, data = views_of_disc("parallel", 8, 64, 24)
+    method: Any = by_name(which)()
+    samples, voxels = method.rays * method.samples_of(64), math.prod(grid.shape)
+
+    def run(steps: int) -> object:
+        return reconstruct(data, geometry, with_settings(method, {"steps": steps}))
+
+    return tuple(SizedRun(steps * samples, voxels, partial(run, steps)) for steps in (1, 4))

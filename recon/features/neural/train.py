@@ -15,14 +15,13 @@ import torch
 from torch import Tensor
 
 from recon.base.arrays import F32, Mask
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
-from recon.features.neural.networks import Field
-from recon.features.neural.rays import Places, drawn, rays_of
+from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume
 from recon.splatting.train import used_and_kept_back
 from recon.voxels.direct import direct_work

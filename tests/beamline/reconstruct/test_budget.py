@@ -31,8 +31,7 @@ from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from recon.base.declared_types import check_settings
 from recon.base.kernel import Kernel
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 
 
