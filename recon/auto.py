@@ -109,9 +109,8 @@ def predicts_best(
             break
         decided.update(prior_decisions(decide.made))
         residuals[at] = _residuals(made, method, judge)
-        if control.on_progress is not None:
-            last, seconds = float(residuals[at].mean()), control.now() - begin
-            control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
+        last = float(residuals[at].mean())
+        control.tell(Progress(done, len(methods), control.now() - begin, last, last, 0, n, unit="methods tried"))
     tried = sorted(residuals)
     listed = "; ".join(f"{methods[at].name} {residuals[at].mean():.4g}" for at in tried)
     if len(tried) + len(refused) < len(methods):

@@ -43,7 +43,7 @@ from recon.base.stop import Stop
 from recon.base.volume import Grid, Slab
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.last_round import LastRound
+from recon.splatting.in_time import LastRound
 from recon.warm_up import warm_up
 
 

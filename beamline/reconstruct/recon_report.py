@@ -135,9 +135,9 @@ def _footnotes(
     if unexplained is not None:
         footnotes.append(
             "Matter that leaves structure: voxels at which the back-projected residual of "
-            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above {UNEXPLAINED_LIMIT:g} a "
-            "fit hides something. It compares fits of the same views: views that are displaced have more noise, so "
-            "less exceeds it."
+            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above "
+            f"{UNEXPLAINED_LIMIT:g} a fit hides something. It compares fits of the same views: views that are "
+            "displaced have more noise, so less exceeds it."
         )
     if "stray" in metrics[made.method]:
         footnotes.append(

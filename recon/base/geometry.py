@@ -428,6 +428,12 @@ class Geometry:
         )
 
 
+def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
+    """ValueError where the values are not [view, row, col] of a geometry's views."""
+    if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):
+        raise ValueError(f"{name} have shape {shape}, the geometry says {expected} [view, row, col]")
+
+
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:
     """All values of a geometry as arrays, by name; `geometry_of_arrays` is the inverse."""
     values = {each.name: getattr(geometry, each.name) for each in fields(Geometry)}

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 from recon.base.stop import Stop
@@ -66,7 +66,7 @@ def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Energies:
+class Energies(Checked):
     """The energy of each view, and the attenuation of the pure materials at these energies.
 
     Attributes:
@@ -77,12 +77,9 @@ class Energies:
     of_view: NDArray[np.intp]
     cross_sections: F64
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
 
 @dataclass(frozen=True, eq=False)
-class DataUse:
+class DataUse(Checked):
     """How the projections are used.
 
     Attributes:
@@ -103,12 +100,9 @@ class DataUse:
     times: F64 | None = None
     energies: Energies | None = None
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
 
 @dataclass(frozen=True, eq=False)
-class RunControl:
+class RunControl(Checked):
     """How a caller watches, ends and continues a reconstruction.
 
     Attributes:
@@ -131,9 +125,6 @@ class RunControl:
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
     @property
     def stop(self) -> Stop:
         """Asks whether the run should end with the volume so far."""
@@ -143,6 +134,16 @@ class RunControl:
     def stop_of_trials(self) -> Callable[[], bool]:
         """Asks whether the trials should end."""
         return self.stop_trials or self.stop
+
+    def tell(self, progress: Progress) -> None:
+        """Report the progress, where somebody listens."""
+        if self.on_progress is not None:
+            self.on_progress(progress)
+
+    def tell_part(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
+        """Report a part of the work, or the work of a direct method, that began at a time of the clock."""
+        if self.on_progress is not None:
+            self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
         """The same control with a deadline by its clock."""

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64, I64
 from recon.base.declared_types import check_arguments, check_settings
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, require_views
 
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
 # of the expansion on three samples at 10 to 10 000 photons (docs/notes/exploration.md). So are the other two.
@@ -219,13 +219,11 @@ class Emission:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        expected = (self.geometry.n_views, *self.geometry.detector_shape)
         for name in ("counts", "survival", "background"):
             values = getattr(self, name)
             if values is None:
                 continue
-            if values.shape != expected:
-                raise ValueError(f"{name} [view, row, col] have shape {values.shape}, the geometry says {expected}")
+            require_views(self.geometry, values, name)
             if not (np.isfinite(values).all() and values.min() >= 0):
                 raise ValueError(f"{name} must be finite and 0 or more, got {values.min()} to {values.max()}")
 

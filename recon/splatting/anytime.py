@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F32
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.optimise import FitState, settle
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 
 HALF = 60.0  # steps after which the rates are half of the first ones
 _WINDOW = 0.25  # share of the steps over which the mean is taken

@@ -20,7 +20,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
+from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
@@ -77,9 +77,7 @@ class _Watch:
         return self.sweep(number, of, "sweeps on voxels")
 
     def sweep(self, number: int, of: int, unit: str) -> bool:
-        if self._control.on_progress is not None:
-            nan, seconds = math.nan, self._control.now() - self._begin
-            self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
+        self._control.tell_part(number, of, self._begin, self._n_views, unit)
         return self.asked()
 
 

@@ -15,9 +15,8 @@ from recon.base.choices import Filter
 from recon.base.choices import Start as Start
 from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
-from recon.base.ray_model import RayModel
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.tv import total_variation

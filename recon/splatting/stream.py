@@ -25,7 +25,18 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
-from recon.splatting.anytime import (HALF, WHILE_VIEWS_COME, average, averaged, checked_views, covered_angle, fallen, is_held_out, next_view, shift_with_axis)
+from recon.splatting.anytime import (
+    HALF,
+    WHILE_VIEWS_COME,
+    average,
+    averaged,
+    checked_views,
+    covered_angle,
+    fallen,
+    is_held_out,
+    next_view,
+    shift_with_axis,
+)
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     default_count,

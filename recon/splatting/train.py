@@ -245,8 +245,7 @@ class _Run:
                 self.views.seen.n_views, self.tracker.value,
             )
         )  # fmt: skip
-        if self.control.on_progress is not None:
-            self.control.on_progress(self.history[-1])
+        self.control.tell(self.history[-1])
 
     def checkpoint(self, state: FitState) -> dict[str, NDArray[Any]]:
         return arrays_of(state, self.fitting.backend) | self.tracker.arrays() | decisions_of(self.decide.made, _DECIDED)

@@ -1,4 +1,4 @@
-"""Checks of the matter in a volume: mass where views show none, structure left in the residual, weak matter that is lost."""
+"""Checks of the matter in a volume: mass where views show none, structure left in the views, weak matter lost."""
 
 from __future__ import annotations
 

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 from recon.base.arrays import F32, F64
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, TRIAL_THRESHOLD
 from recon.base.geometry import Geometry
-from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Traits
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.patches import scratch_values
@@ -24,7 +24,7 @@ from recon.voxels.held_out import (
     choose_weight,
     preferred_strength,
 )
-from recon.voxels.iterative import TV_WEIGHT_CHOSEN, run_iterative
+from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
 from recon.voxels.voxel_problem import (
     Momentum,
@@ -48,7 +48,7 @@ from recon.voxels.work import (
 
 
 @dataclass(frozen=True)
-class FistaTv:
+class FistaTv(VoxelMethod):
     """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.priors`. Memory: 7 volumes,
     2 x the projections.
 
@@ -64,22 +64,16 @@ class FistaTv:
     label: ClassVar[str] = "FISTA-TV"
     traits: ClassVar[Traits] = Traits(budget=True, halo=12, error_bars=(2.2, 0.1))
 
-    iterations: int = 20
-    tv_weight: float | None = None
-    subsets: int = 9
-    tv_steps: int = 3
+    iterations: Count = 20
+    tv_weight: NonNegative | None = None
+    subsets: Count = 9
+    tv_steps: Count = 3
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 1}, least={"tv_weight": 0.0})
 
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         return self.with_weight(problem, x)[0]
@@ -106,9 +100,6 @@ class FistaTv:
             problem.decide(TV_WEIGHT_CHOSEN, lambda: float(used / (subsets.plain_norm * len(subsets.views) * unit)))
         return x, weight
 
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         count = subsets_of(geometry, self.subsets, FEWEST_SUBSETS)
         start = ordered_sweeps(geometry, grid, 1, 9) + power_rounds(geometry, grid, count)
@@ -121,7 +112,7 @@ class FistaTv:
 
 
 @dataclass(frozen=True)
-class OsSirtTv:
+class OsSirtTv(VoxelMethod):
     """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
     It is for views of very few photons (10 to 30 a pixel: up to 2 dB ahead), and with `momentum` for a quick volume.
@@ -139,23 +130,17 @@ class OsSirtTv:
     label: ClassVar[str] = "OS-SIRT-TV"
     traits: ClassVar[Traits] = Traits(budget=True, halo=20)
 
-    iterations: int = 40
-    subsets: int = 9
-    tv_weight: float | None = None
-    tv_steps: int = 5
+    iterations: Count = 40
+    subsets: Count = 9
+    tv_weight: NonNegative | None = None
+    tv_steps: Natural = 5
     momentum: bool = False
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1, "subsets": 1, "tv_steps": 0}, least={"tv_weight": 0.0})
 
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector = problem.projector
@@ -186,9 +171,6 @@ class OsSirtTv:
             problem.decide(TV_WEIGHT_CHOSEN, lambda: threshold / unit)
         return x
 
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         step = on_volume("tv", grid, self.tv_steps + 1) + on_volume("pass", grid, 2 * self.momentum)
         work = ordered_sweeps(geometry, grid, self.iterations, self.subsets) + self.iterations * step
@@ -199,7 +181,7 @@ class OsSirtTv:
 
 
 @dataclass(frozen=True)
-class PnpDct:
+class PnpDct(VoxelMethod):
     """Steps towards the views, and patches of 4 x 4 x 4 voxels with few cosine coefficients, in turn; see
     `recon.voxels.priors`. The first volume is that of FISTA-TV, unless one is given. Memory: as `FistaTv`.
 
@@ -213,25 +195,16 @@ class PnpDct:
     label: ClassVar[str] = "PnP-DCT"
     traits: ClassVar[Traits] = Traits(halo=16, own_length=True, error_bars=(2.3, 0.25))
 
-    iterations: int = 35
-    patch_threshold: float | None = None
+    iterations: Count = 35
+    patch_threshold: NonNegative | None = None
     allow_negative: bool = False
 
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1}, least={"patch_threshold": 0.0})
-
-    @property
-    def first_sweeps(self) -> int:
-        """Sweeps of FISTA-TV before the first step."""
-        return FistaTv().iterations
+    first_sweeps: ClassVar[int] = FistaTv.iterations
 
     @property
     def trial_sweeps(self) -> int:
         """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
         return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * TRIAL_STEPS
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         ended, sweeps = False, 0 if x.any() else self.first_sweeps
@@ -256,9 +229,6 @@ class PnpDct:
             strength = problem.decide("threshold", lambda: share * density_unit(x))
         further = replace(problem, go_on=lambda step, residual: problem.go_on(sweeps + step, residual))
         return pnp_dct(further, x, strength, steps=self.iterations)
-
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         first = FistaTv().costs(geometry, grid)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from typing import ClassVar, NamedTuple, Self
 
@@ -13,12 +13,12 @@ import numpy as np
 from scipy.special import xlogy
 
 from recon.base.arrays import F32
-from recon.base.declared_types import check_arguments, check_settings
+from recon.base.declared_types import Checked, Count, check_arguments
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
-from recon.base.work import Costs, Work
+from recon.base.work import Costs
 from recon.prep.counts import Emission
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import interleaved, iterative_memory
@@ -215,7 +215,7 @@ _FLOOR = 1e-6  # of the mean line integral
 
 
 @dataclass(frozen=True)
-class Mlem:
+class Mlem(Checked):
     """See `likelihood.mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
 
     Line integrals that come without counts are taken for counts with their weights as survival.
@@ -229,88 +229,65 @@ class Mlem:
     label: ClassVar[str] = "MLEM"
     traits: ClassVar[Traits] = Traits(own_length=True)
 
-    iterations: int | None = None
+    iterations: Count | None = None
 
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1})
+    def parts(self, views: int) -> int:
+        """Subsets of so many views."""
+        return 1
 
     @property
     def most_iterations(self) -> int:
         """As many as counts held out may ask for."""
-        return UPDATES
+        return UPDATES // self.parts(UPDATES)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return _run(self, problem, control, 1)
+        begin, views = control.now(), problem.geometry.n_views
+        subsets, history = self.parts(views), list[Progress]()
+
+        def tried(done: int) -> bool:
+            control.tell_part(done, 0, begin, views, "iterations tried on half")
+            return not control.stop()
+
+        def report(iteration: int, likelihood: float, residual: float) -> bool:
+            seconds = control.now() - begin
+            history.append(Progress(iteration, iterations, seconds, -likelihood, residual, 0, views))
+            control.tell(history[-1])
+            return control.stop()
+
+        emission, most = _emission(problem), max(1, UPDATES // subsets)
+        chosen = self.iterations
+        if chosen is None and problem.use.emission is not None:
+            rng = np.random.default_rng(problem.seed)
+            chosen = passes_by_halves(emission, problem.grid, subsets, most, rng, tried)
+        iterations = most if chosen is None else chosen
+        volume = mlem(emission, problem.grid, iterations, subsets, report)
+        return Reconstruction(volume, {**asdict(self), "iterations": iterations}, tuple(history))
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return Costs({self.name: _work(self, geometry, grid, 1)})
+        """At most: counts held out may ask for fewer iterations, after as many trials on halves of them."""
+        iterations = self.most_iterations if self.iterations is None else self.iterations
+        step = sweep(geometry, grid) + on_volume("pass", grid, 6 * self.parts(geometry.n_views))
+        return Costs({self.name: (iterations + 0.5) * step})
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return _memory(geometry, grid, weighted, 1)
+        subsets = self.parts(geometry.n_views)
+        return iterative_memory(geometry, grid, 4.5 + subsets, 5.2 + 4 / subsets, 1.1 * weighted)
 
 
 @dataclass(frozen=True)
-class Osem:
+class Osem(Mlem):
     """`Mlem` by subsets of the views, about as many times faster; without the promise of a likelihood that rises."""
 
     name: ClassVar[str] = "osem"
     label: ClassVar[str] = "OSEM"
-    traits: ClassVar[Traits] = Traits(own_length=True)
 
-    iterations: int | None = None
-    subsets: int = 4
+    subsets: Count = 4
 
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1, "subsets": 1})
-
-    @property
-    def most_iterations(self) -> int:
-        """As many as counts held out may ask for."""
-        return max(1, UPDATES // self.subsets)
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return _run(self, problem, control, min(self.subsets, problem.geometry.n_views))
-
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
-    def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        return Costs({self.name: _work(self, geometry, grid, min(self.subsets, geometry.n_views))})
-
-    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        return _memory(geometry, grid, weighted, min(self.subsets, geometry.n_views))
-
-
-def _run(method: Mlem | Osem, problem: ReconProblem, control: RunControl, subsets: int) -> Reconstruction:
-    begin, views = control.now(), problem.geometry.n_views
-    history: list[Progress] = []
-
-    def go_on(progress: Progress) -> bool:
-        if control.on_progress is not None:
-            control.on_progress(progress)
-        return not control.stop()
-
-    def tried(done: int) -> bool:
-        seconds = control.now() - begin
-        return go_on(Progress(done, 0, seconds, math.nan, math.nan, 0, views, unit="iterations tried on half"))
-
-    def report(iteration: int, likelihood: float, residual: float) -> bool:
-        seconds = control.now() - begin
-        history.append(Progress(iteration, iterations, seconds, -likelihood, residual, 0, views))
-        return not go_on(history[-1])
-
-    emission, most = _emission(problem), max(1, UPDATES // subsets)
-    chosen = method.iterations
-    if chosen is None and problem.use.emission is not None:
-        rng = np.random.default_rng(problem.seed)
-        chosen = passes_by_halves(emission, problem.grid, subsets, most, rng, tried)
-    iterations = most if chosen is None else chosen
-    volume = mlem(emission, problem.grid, iterations, subsets, report)
-    settings = {f.name: getattr(method, f.name) for f in fields(method)}
-    return Reconstruction(volume, settings | {"iterations": iterations}, tuple(history))
+    def parts(self, views: int) -> int:
+        return min(self.subsets, views)
 
 
 def _emission(problem: ReconProblem) -> Emission:
@@ -327,14 +304,3 @@ def _emission(problem: ReconProblem) -> Emission:
         return replace(given, geometry=problem.geometry)
     survival = np.ones_like(given.counts) if given.survival is None else given.survival
     return Emission(given.counts * (weights > 0), problem.geometry, survival * (weights > 0), given.background)
-
-
-def _memory(geometry: Geometry, grid: Grid, weighted: bool, subsets: int) -> int:
-    return iterative_memory(geometry, grid, 4.5 + subsets, 5.2 + 4 / subsets, 1.1 * weighted)
-
-
-def _work(method: Mlem | Osem, geometry: Geometry, grid: Grid, subsets: int) -> Work:
-    """At most: counts held out may ask for fewer iterations, after as many trials on halves of them."""
-    iterations = method.most_iterations if method.iterations is None else method.iterations
-    step = sweep(geometry, grid) + on_volume("pass", grid, 6 * subsets)
-    return (iterations + 0.5) * step

@@ -3,45 +3,39 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import truediv
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import Count, Natural, NonNegative, Positive
 from recon.base.geometry import Geometry
-from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Traits
 from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.direct import direct_work
-from recon.voxels.iterative import run_iterative
+from recon.voxels.iterative import VoxelMethod
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, difference_weights, interleaved, iterative_memory
 from recon.voxels.work import on_volume, ordered_sweeps, sweep
 
 
 @dataclass(frozen=True)
-class Sirt:
+class Sirt(VoxelMethod):
     """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
     traits: ClassVar[Traits] = Traits()
 
-    iterations: int = 100
-    relaxation: float = 1.0
+    iterations: Count = 100
+    relaxation: Positive = 1.0
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1}, above={"relaxation": 0.0})
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps, scale = problem.sweeps([np.arange(problem.projector.geometry.n_views)]), problem.scale
@@ -51,9 +45,6 @@ class Sirt:
                 break
         return x
 
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         return Costs({self.name: ordered_sweeps(geometry, grid, self.iterations, 1)})
 
@@ -62,7 +53,7 @@ class Sirt:
 
 
 @dataclass(frozen=True)
-class Sart:
+class Sart(VoxelMethod):
     """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
 
     The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
@@ -72,16 +63,10 @@ class Sart:
     label: ClassVar[str] = "SART"
     traits: ClassVar[Traits] = Traits()
 
-    iterations: int = 20
-    relaxation: float = 1.0
-    decay: float = 0.999
+    iterations: Count = 20
+    relaxation: Positive = 1.0
+    decay: Positive = 0.999
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1}, above={"relaxation": 0.0, "decay": 0.0})
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         sweeps, scale = problem.single_views(), problem.scale
@@ -91,9 +76,6 @@ class Sart:
                 break
         return x
 
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         return Costs({self.name: ordered_sweeps(geometry, grid, self.iterations, geometry.n_views)})
 
@@ -102,7 +84,7 @@ class Sart:
 
 
 @dataclass(frozen=True)
-class Cgls:
+class Cgls(VoxelMethod):
     """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); its early end is its regularisation.
 
     Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations. From
@@ -113,14 +95,8 @@ class Cgls:
     label: ClassVar[str] = "CGLS"
     traits: ClassVar[Traits] = Traits(own_length=True)
 
-    iterations: int = 10
+    iterations: Count = 10
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"iterations": 1})
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector = problem.projector
@@ -150,9 +126,6 @@ class Cgls:
             np.maximum(x, 0, out=x)
         return x
 
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
-
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         step = sweep(geometry, grid) + on_volume("pass", grid, 3)
         return Costs({self.name: (1 + self.iterations) * step})
@@ -162,7 +135,7 @@ class Cgls:
 
 
 @dataclass(frozen=True)
-class AsdPocs:
+class AsdPocs(VoxelMethod):
     """Adaptive steepest descent of TV between projections onto the data (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
     A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep. Steps
@@ -179,26 +152,15 @@ class AsdPocs:
     label: ClassVar[str] = "ASD-POCS"
     traits: ClassVar[Traits] = Traits(halo=8)
 
-    iterations: int = 10
-    relaxation: float = 1.0
-    decay: float = 0.9999
-    tv_steps: int = 20
-    alpha: float = 0.002
-    alpha_decay: float = 0.95
-    ratio: float = 0.94
-    goal: float | None = None
+    iterations: Count = 10
+    relaxation: Positive = 1.0
+    decay: Positive = 0.9999
+    tv_steps: Natural = 20
+    alpha: NonNegative = 0.002
+    alpha_decay: NonNegative = 0.95
+    ratio: NonNegative = 0.94
+    goal: NonNegative | None = None
     allow_negative: bool = False
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            whole={"iterations": 1, "tv_steps": 0},
-            least=dict.fromkeys(("alpha", "alpha_decay", "ratio", "goal"), 0.0),
-            above=dict.fromkeys(("relaxation", "decay"), 0.0),
-        )
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector, decide = problem.projector, problem.decide
@@ -232,9 +194,6 @@ class AsdPocs:
             if decide("shorter", partial(bool, undone and error > goal)):
                 step *= self.alpha_decay
         return x
-
-    def toy(self) -> Self:
-        return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
         descent = on_volume("slope", grid, self.tv_steps) + on_volume("pass", grid, self.tv_steps + 6)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.base.arrays import F32, F64
+from recon.base.arrays import F32, F64, bin_views
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.motion import Motion, Seen, improved, moved, weighed
@@ -146,17 +146,11 @@ def learnt_motion(
 def _binned(views: EnergyViews, n: int) -> EnergyViews:
     """Mean of n x n pixels; of their weights, too."""
     n = max(1, min(n, *views.geometry.detector_shape))
-
-    def mean(images: F32) -> F32:
-        count, rows, cols = images.shape
-        part = images[:, : rows // n * n, : cols // n * n].reshape(count, rows // n, n, cols // n, n)
-        return np.asarray(part.mean((2, 4), dtype=np.float32), np.float32)
-
     geometry = views.geometry.binned(n)
     if views.weight is None:
-        return replace(views, projections=mean(views.projections), geometry=geometry)
-    weight = mean(views.weight)
-    data = np.divide(mean(views.projections * views.weight), np.maximum(weight, np.float32(1e-6)), dtype=np.float32)
+        return replace(views, projections=bin_views(views.projections, n), geometry=geometry)
+    weight, sums = bin_views(views.weight, n), bin_views(views.projections * views.weight, n)
+    data = np.divide(sums, np.maximum(weight, np.float32(1e-6)), dtype=np.float32)
     return replace(views, projections=data, geometry=geometry, weight=weight)
 
 

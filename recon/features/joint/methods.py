@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import Bound, Checked, Count, NonNegative, check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume, VolumeSeries
@@ -28,7 +28,7 @@ _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned vi
 
 
 @dataclass(frozen=True)
-class TimeSeries:
+class TimeSeries(Checked):
     """Volumes at even times of one scan of a sample that changes, see `fit_series`.
 
     Attributes:
@@ -45,13 +45,10 @@ class TimeSeries:
     label: ClassVar[str] = "Volumes in time"
     traits: ClassVar[Traits] = Traits(in_time=True)
 
-    volumes: int = 2
+    volumes: Annotated[int, Bound(2)] = 2
     moves: bool | None = None
-    sweeps: int = SWEEPS
-    weight: float | None = None
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"volumes": 2, "sweeps": 1}, least={"weight": 0.0})
+    sweeps: Count = SWEEPS
+    weight: NonNegative | None = None
 
     @property
     def volume_names(self) -> tuple[str, ...]:
@@ -113,11 +110,11 @@ class EnergySeries:
 
     materials: tuple[str, ...] = ("matter",)
     states: tuple[str, ...] = ()
-    sweeps: int = MATERIAL_SWEEPS
-    weight: float | None = None
+    sweeps: Count = MATERIAL_SWEEPS
+    weight: NonNegative | None = None
 
     def __post_init__(self) -> None:
-        check_settings(self, whole={"sweeps": 1}, least={"weight": 0.0})
+        check_settings(self)
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "states", tuple(self.states))
         if not self.materials or len(set(self.materials)) < len(self.materials):
@@ -230,8 +227,7 @@ class _History:
 
     def _tell(self, reached: Progress) -> Progress:
         now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        if self.control.on_progress is not None:
-            self.control.on_progress(now)
+        self.control.tell(now)
         return now
 
     def result(

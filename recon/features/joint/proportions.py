@@ -22,9 +22,9 @@ from recon.base.arrays import F32, F64
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
-from recon.features.joint.energy_fit import EnergyViews
+from recon.features.joint.energy_fit import EnergyViews, trial_rows
+from recon.features.joint.motion import conjugate_gradients
 from recon.features.joint.spectral import Materials
-from recon.voxels.held_out import busiest_rows, slab_of
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9  # first λ over the mean curvature of the views; its ratio to the next
@@ -140,7 +140,7 @@ class Proportions:
         return np.ones((self.shares.shape[1], *self.matter.shape), np.float32)
 
     def solved(self, smooth: float, factors: F32, go_on: Callable[[], bool], steps: int = SOLUTION_STEPS) -> F32:
-        """Steps of conjugate gradients (Hestenes & Stiefel 1952) from first factors.
+        """Steps of conjugate gradients from first factors.
 
         Args:
             smooth: λ over the mean curvature of the views.
@@ -154,17 +154,7 @@ class Proportions:
             def normal(of: F32) -> F32:
                 return self.explained(self.shown(of)) + weight * self.rough(of)
 
-            left = self.explained(self.data) - normal(found)
-            towards, squares = left.copy(), float(np.vdot(left, left))
-            for _ in range(steps):
-                if squares == 0 or not go_on():
-                    break
-                image = normal(towards)
-                length = np.float32(squares / float(np.vdot(towards, image)))
-                found += length * towards
-                left -= length * image
-                before, squares = squares, float(np.vdot(left, left))
-                towards = left + np.float32(squares / before) * towards
+            conjugate_gradients(normal, self.explained(self.data) - normal(found), found, steps, go_on)
         return found
 
 
@@ -262,13 +252,11 @@ def _even(problem: Proportions) -> F32:
 
 
 def _smoothness(views: EnergyViews, found: Materials, states: tuple[int, int], steps: Countdown) -> float:
-    densities, grid, rows = found.densities, found.grid, slice(None)
-    n_rows = views.geometry.detector_shape[0]
-    if views.geometry.rows_show_slices and grid.shape[0] == n_rows:
-        rows = busiest_rows(views.projections, _ROWS)
-        densities = densities[:, rows]
-        grid = slab_of(views.geometry, grid, *rows.indices(n_rows)[:2])[1]
-    problem = share_problem(views.select(np.arange(views.geometry.n_views), rows), densities, states, grid)
+    rows, grid = slice(None), found.grid
+    if grid.shape[0] == views.geometry.detector_shape[0]:
+        rows, grid = trial_rows(views, grid, _ROWS)
+    some = views.select(np.arange(views.geometry.n_views), rows)
+    problem = share_problem(some, found.densities[:, rows], states, grid)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     first, problem = _even(problem), replace(problem, stop=steps.stop)
     fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))

@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from recon.base.declared_types import check_settings
+from recon.base.declared_types import Bound, Count, Natural
+from recon.base.work import SizedRun
 from recon.features.neural.networks import Field, HashGrid, Waves
 from recon.features.neural.train import FieldMethod
-from recon.base.work import SizedRun
 from recon.methods import by_name, with_settings
 from recon.reconstruction import reconstruct
 
@@ -33,12 +33,8 @@ class _HashField(FieldMethod):
         log2_table: logarithm of the most entries of a level.
     """
 
-    levels: int | None = None
-    log2_table: int = 19
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"levels": (1, 16), "log2_table": (8, 24)})
+    levels: Annotated[int, Bound(1, 16)] | None = None
+    log2_table: Annotated[int, Bound(8, 24)] = 19
 
     def grid_of(self, across: int) -> HashGrid:
         to_voxels = 1 + max(0, math.ceil(math.log2(across / _COARSEST)))
@@ -71,12 +67,8 @@ class SaxNerf(_HashField):
     name: ClassVar[str] = "sax-nerf"
     label: ClassVar[str] = "SAX-NeRF"
 
-    window_count: int = 16
-    window_side: int = 8
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"window_count": 0, "window_side": 1})
+    window_count: Natural = 16
+    window_side: Count = 8
 
     @property
     def windows(self) -> tuple[int, int]:
@@ -101,11 +93,7 @@ class IntraTomo(FieldMethod):
 
     rate: float = 3e-3
     width: int = 128
-    bands: int = 6
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"bands": 1})
+    bands: Count = 6
 
     def network(self, across: int) -> Field:
         highest = None if self.allow_negative else self.highest

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_kernels
@@ -23,7 +23,7 @@ from recon.kernels.cpu import joseph
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project as gaussian_views
 from recon.splatting.splat import voxelize
-from recon.voxels.fdk import fdk
+from recon.voxels.direct import fdk
 from recon.voxels.projector import Projector, data_residual, project
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
