@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 
-
 class Kernel(StrEnum):
     """Profile f(q) of the squared distance q from the centre, in standard deviations; f(0) = 1.
 

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Stop
 from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
-from recon.base.stop import Stop
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Plain = str | int | float
@@ -252,11 +251,12 @@ class Traits:
         held_out: views can be held out.
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
-        budget: a time budget chooses its settings, see `recon.assess.plans`.
+        budget: a time budget chooses its settings, see `recon.assess.time_model`.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
-        in_time: it makes several volumes, at times of the scan, all at once in memory; it is a `JointMethod`.
+        in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
+            `volume_names` if they are of materials; `Reconstruction.series` has all.
         by_energy: likewise, of each material, from scans at several energies.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
@@ -308,18 +308,6 @@ class Method(Protocol):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory of `run` in bytes, without the projections, and without their weights if they are `weighted`."""
-
-
-class JointMethod(Method, Protocol):
-    """A method with the trait `in_time` or `by_energy`: `Reconstruction.series` has all of its volumes."""
-
-    @property
-    def volumes(self) -> int:
-        """Number of its volumes."""
-
-    @property
-    def volume_names(self) -> tuple[str, ...]:
-        """Names of the materials; empty if its volumes are of times."""
 
 
 @runtime_checkable

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from recon.assess.plans import MODEL_STEPS, PRESETS, best_steps
+from recon.assess.time_model import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.declared_types import Checked, Count, Natural, NonNegative
@@ -21,11 +21,11 @@ from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.in_time import fit_costs
 from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
-from recon.splatting.work import fit_costs
 from recon.voxels.methods import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 

@@ -28,6 +28,8 @@ from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
     HALF,
     WHILE_VIEWS_COME,
+    BetterVolume,
+    PredictionErrors,
     average,
     averaged,
     checked_views,
@@ -47,7 +49,6 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.splatting.shown import BetterVolume, PredictionErrors
 from recon.voxels.field_edges import wider_than_field
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this

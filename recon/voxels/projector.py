@@ -258,27 +258,17 @@ def project(volume: Volume, geometry: Geometry) -> F32:
     return Projector(geometry, volume.grid).forward(volume.data)
 
 
-def data_residual(
+def residual_norms(
     volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
-) -> float:
-    """||A x - p|| / ||p||: the share of the measured line integrals [view, row, col] that the volume does not explain.
+) -> tuple[float, float]:
+    """||A x - p|| and ||p||: their ratio is the share of the line integrals [view, row, col] that the volume leaves.
 
     Args:
         weights: of the rays; None: equal weights. Rays of weight 0 do not count.
 
     Raises:
-        ValueError: if `projections` does not fit `geometry`, or is all zero.
+        ValueError: `projections` do not fit the geometry.
     """
-    left, scale = residual_norms(volume, projections, geometry, weights)
-    if scale == 0:
-        raise ValueError("projections are all zero, so there is nothing to explain")
-    return left / scale
-
-
-def residual_norms(
-    volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
-) -> tuple[float, float]:
-    """||A x - p|| and ||p||; see `data_residual`."""
     require_views(geometry, projections)
     root = np.float32(1) if weights is None else np.sqrt(weights)
     known = projections if weights is None else np.where(weights > 0, projections, np.float32(0))

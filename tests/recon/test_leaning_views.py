@@ -13,7 +13,8 @@ from recon.auto import Auto, part_of
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
 from recon.voxels.odd_views import odd_views
-from recon.voxels.projector import Projector, data_residual, seen_rays
+from recon.voxels.projector import Projector, seen_rays
+from tests.recon.helpers import data_residual
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])

@@ -17,7 +17,8 @@ from recon.kernels.cpu.spread import spread
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize
 from recon.voxels.fbp import fbp
-from recon.voxels.projector import Projector, data_residual, views_of_exposure
+from recon.voxels.projector import Projector, views_of_exposure
+from tests.recon.helpers import data_residual
 from tests.recon.voxels.balls import ball_views
 
 ANGLES = np.arange(9) * 0.37
