@@ -6,12 +6,30 @@ The state is unknown while the operator is asked, and stays unknown if the reque
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 Ask = Callable[[str], None]
 """Shows the operator a request and returns once it is confirmed; raises the caller's own error otherwise."""
 
 
-class ManualShutter:
+class _Manual:
+    """A device that the operator moves; `_state` is what he has confirmed last, None where it is not known."""
+
+    _name = ""
+
+    def __init__(self, ask: Ask, name: str = "") -> None:
+        self.name, self._ask = name or self._name, ask
+        self._state: Any = None
+
+    def _bring(self, state: object, request: str) -> None:
+        """Ask for a state, unless it is the present one."""
+        if self._state != state:
+            self._state = None
+            self._ask(request)
+            self._state = state
+
+
+class ManualShutter(_Manual):
     """Implements `drivers.base.protocols.Shutter` by asking the operator.
 
     The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
@@ -19,81 +37,56 @@ class ManualShutter:
     """
 
     by_hand = True
-
-    def __init__(self, ask: Ask, name: str = "shutter") -> None:
-        self.name = name
-        self._ask = ask
-        self._open: bool | None = None
+    _name = "shutter"
 
     def open(self) -> None:
-        if self._open is not True:
-            self._open = None
-            self._ask("Open the beam shutter.")
-            self._open = True
+        self._bring(True, "Open the beam shutter.")
 
     def close(self) -> None:
-        if self._open is not False:
-            self._open = None
-            self._ask("Close the beam shutter.")
-            self._open = False
+        self._bring(False, "Close the beam shutter.")
 
     def is_open(self) -> bool:
         """The state last confirmed; False before the first confirmation, the safe assumption for a measurement."""
-        return self._open is True
+        return self._state is True
 
 
-class ManualSampleMover:
+class ManualSampleMover(_Manual):
     """Implements `drivers.base.protocols.SampleMover` by asking the operator; the sample starts in the beam."""
 
-    def __init__(self, ask: Ask, name: str = "sample mover") -> None:
-        self.name = name
-        self._ask = ask
-        self._in: bool | None = True
+    _name = "sample mover"
+
+    def __init__(self, ask: Ask, name: str = "") -> None:
+        super().__init__(ask, name)
+        self._state = "in"
 
     def out(self) -> None:
-        if self._in is not False:
-            self._in = None
-            self._ask("Move the sample out of the beam.")
-            self._in = False
+        self._bring("out", "Move the sample out of the beam.")
 
     def back(self) -> None:
-        if self._in is not True:
-            self._in = None
-            self._ask("Move the sample back into the beam, to the same place.")
-            self._in = True
+        self._bring("in", "Move the sample back into the beam, to the same place.")
 
 
-class ManualFilter:
+class ManualFilter(_Manual):
     """Implements `drivers.base.protocols.Filter` by asking the operator; which one is in at the start is not known."""
 
-    def __init__(self, ask: Ask, name: str = "filter") -> None:
-        self.name = name
-        self._ask = ask
-        self._place: str | None = None
+    _name = "filter"
 
     def put(self, place: str) -> None:
-        if place != self._place:
-            self._place = None
-            self._ask(f"Put the filter into the beam: {place}.")
-            self._place = place
+        self._bring(place, f"Put the filter into the beam: {place}.")
 
     def place(self) -> str | None:
-        return self._place
+        place: str | None = self._state
+        return place
 
 
-class ManualMonochromator:
+class ManualMonochromator(_Manual):
     """Implements `drivers.base.protocols.Monochromator` by asking the operator; the first energy is not known."""
 
-    def __init__(self, ask: Ask, name: str = "monochromator") -> None:
-        self.name = name
-        self._ask = ask
-        self._energy: float | None = None
+    _name = "monochromator"
 
     def move_to(self, energy: float) -> None:
-        if energy != self._energy:
-            self._energy = None
-            self._ask(f"Set the monochromator to {energy:.7g} keV.")
-            self._energy = energy
+        self._bring(energy, f"Set the monochromator to {energy:.7g} keV.")
 
     def energy(self) -> float | None:
-        return self._energy
+        energy: float | None = self._state
+        return energy

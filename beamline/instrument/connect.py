@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar
 
 import click
 
@@ -52,6 +52,12 @@ from drivers.stages.travel import Travel
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
 
+
+class Closable(Protocol):
+    def close(self) -> None: ...
+
+
+Connected = TypeVar("Connected", bound=Closable)
 TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
 
 
@@ -151,9 +157,7 @@ def connect(
             ask = ask or ask_operator
             devices = _instrument(config, clock, ask, check_stop, opened, memory)
             if isinstance(chosen := config.devices.sample_mover, StageMover):
-                mover = chosen.connect(clock)
-                opened.callback(mover.close)
-                devices = replace(devices, sample=mover)
+                devices = replace(devices, sample=_held(chosen.connect(clock), opened))
             devices = replace(
                 devices,
                 filter=_filter(config, clock, ask, opened),
@@ -164,8 +168,7 @@ def connect(
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
         if isinstance(wanted := config.devices.beam_monitor, BeamMonitorSection):
-            monitor = make_beam_monitor(wanted, clock)
-            opened.callback(monitor.close)
+            monitor = _held(make_beam_monitor(wanted, clock), opened)
 
         def watch(check: Callable[[], None]) -> None:
             for device in (devices.shutter, devices.sample, devices.filter, devices.monochromator):
@@ -209,23 +212,26 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     return limits, timing, Travel("stage", limits).to_counts
 
 
+def _held(device: Connected, opened: ExitStack) -> Connected:
+    """The device, which is closed at the end."""
+    opened.callback(device.close)
+    return device
+
+
 def _instrument(
     config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack, memory: FrameMemory
 ) -> Devices:
     chosen = config.devices.camera
     if isinstance(chosen, SimulatedOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
-    stage = config.devices.stage.connect(clock)
-    opened.callback(stage.close)
+    stage = _held(config.devices.stage.connect(clock), opened)
     camera: Camera
     if isinstance(chosen, DcamOrca):
-        camera = orca = make_camera(chosen, clock, memory)
-        opened.callback(camera.close)
+        camera = orca = _held(make_camera(chosen, clock, memory), opened)
         if chosen.cool_s:
             wait_until_cold(orca, chosen.cool_s, clock, check_stop)
     else:
-        camera = chosen.connect(clock)
-        opened.callback(camera.close)
+        camera = _held(chosen.connect(clock), opened)
     shutter = shutter_of(config, stage, clock, ask)
     if isinstance(shutter, ConnectedShutter):
         opened.callback(shutter.disconnect)
@@ -235,18 +241,14 @@ def _instrument(
 def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
     wanted = config.devices.filter
     if isinstance(wanted, MotorFilter | FoundFilter):
-        connected = wanted.connect(clock)
-        opened.callback(connected.close)
-        return connected
+        return _held(wanted.connect(clock), opened)
     return None if isinstance(wanted, NoFilter) else ManualFilter(ask)
 
 
 def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
     wanted = config.devices.monochromator
     if isinstance(wanted, FoundMonochromator):
-        connected = wanted.connect(clock)
-        opened.callback(connected.close)
-        return connected
+        return _held(wanted.connect(clock), opened)
     return None if isinstance(wanted, NoMonochromator) else ManualMonochromator(ask)
 
 

@@ -78,7 +78,9 @@ def _behind_pvs(choices: dict[str, tuple[str, ...]], places: dict[str, float | s
         served = Variables({"wanted": 0.0, "is": 3.0}, choices, follow=follow)
         opened.enter_context(serve_pva(served, clock, patch))
         url = f"pva://{PREFIX}"
-        changer = PvFilter(FilterPvs(f"{url}wanted", f"{url}is", places, 5.0, travel=4.0), clock)
+        changer = PvFilter(
+            FilterPvs(pv=f"{url}wanted", status_pv=f"{url}is", places=places, timeout=5.0, travel=4.0), clock
+        )
         opened.callback(changer.close)
         return Rig(changer, lambda: len(written), lambda: stuck.append(True))
 

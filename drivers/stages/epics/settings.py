@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits
+from drivers.flat import Declared
 from drivers.stages.settings import StageFigures, Wiring, key
 
 
@@ -24,7 +25,7 @@ class Search(StrEnum):
 
 
 @dataclass(frozen=True)
-class EpicsSettings:
+class EpicsSettings(Declared):
     """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
 
     `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from drivers.base.protocols import StageLimits
+from drivers.flat import Declared
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.zaber.train import PulseSettings, TriggerUse
 
@@ -13,7 +14,7 @@ SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a 
 
 
 @dataclass(frozen=True)
-class ZaberSettings:
+class ZaberSettings(Declared):
     """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output.
 
     counts_per_turn must be the device's own limit.cycle.dist. The pulse width is whole milliseconds; None is 1 ms, or
@@ -38,10 +39,7 @@ class ZaberSettings:
     triggers: TriggerUse = field(default=TriggerUse())
 
     def __post_init__(self) -> None:
-        if not (1 <= self.device <= 99 and 1 <= self.axis <= 9):
-            raise ValueError(
-                f"device {self.device}, axis {self.axis} cannot exist; expected device 1 to 99 and axis 1 to 9"
-            )
+        super().__post_init__()
         self.limits()
 
     @property

@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.settings import key
+from drivers.flat import Declared, key
 
 SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
 
 
 @dataclass(frozen=True)
-class TriggerUse:
+class TriggerUse(Declared):
     """Use of the device's triggers. Defaults are its firmware's behaviour from memory; so is the encoder's unit,
     microsteps.
 
@@ -35,10 +35,11 @@ class TriggerUse:
     shortest: float = key(SHORTEST, "Between two fires at full speed.", unit="s", gt=0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.fires_when_enabled and not self.chained:
             raise ValueError("a trigger that fires when enabled needs another one to enable it: chained")
-        if self.starter == self.repeater or min(self.starter, self.repeater) < 1:
-            raise ValueError("starter and repeater are two different triggers, they count from 1")
+        if self.starter == self.repeater:
+            raise ValueError(f"starter and repeater must be two different triggers, got {self.starter} for both")
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,6 @@ class PulseSettings:
     def __post_init__(self) -> None:
         if self.width is not None and not (self.width > 0 and abs(self.width * 1000 - self.milliseconds) < 1e-6):
             raise ValueError(f"a pulse width of {self.width:g} s is not possible; it is whole milliseconds, 1 or more")
-        if self.output < 1:
-            raise ValueError(f"there is no output {self.output}; outputs count from 1")
 
     @property
     def milliseconds(self) -> int:

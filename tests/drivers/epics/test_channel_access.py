@@ -65,7 +65,7 @@ def test_a_shutter_by_labels(ioc: ProcessVariable) -> None:
 
 def test_a_filter_by_labels(ioc: ProcessVariable) -> None:
     url = f"{URL}blade"
-    changer = PvFilter(FilterPvs(url, url, {"none": "Open", "Al 1 mm": "Closed"}, timeout=30.0), SystemClock())
+    changer = PvFilter(FilterPvs(pv=url, places={"none": "Open", "Al 1 mm": "Closed"}, timeout=30.0), SystemClock())
     for place, label in (("Al 1 mm", "Closed"), ("none", "Open")):
         changer.put(place)
         assert changer.place() == place and ioc.read("blade")[0].label == label

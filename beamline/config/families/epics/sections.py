@@ -8,9 +8,8 @@ from pydantic import Field, model_validator
 
 from beamline.config.beam import FoundMonochromator, FoundShutter
 from beamline.config.places import FoundFilter, Name, refuse_equal
-from beamline.config.section import declared, read_from, section_of, without
+from beamline.config.section import declared, read_from, section_of
 from drivers.base.clock import Clock
-from drivers.epics.channel import url_problem
 from drivers.epics.devices import (
     FilterPvs,
     MonochromatorPvs,
@@ -20,40 +19,22 @@ from drivers.epics.devices import (
     ShutterPvs,
 )
 
-PvUrl = Annotated[str, without(url_problem)]
-Seconds = Annotated[float, Field(gt=0, le=1e6)]
+_KIND = {"kind": (Literal["epics"], ...)}
 
 
-class EpicsShutter(section_of("EpicsShutterKeys", FoundShutter, declared(ShutterPvs))):  # type: ignore[misc]
+class EpicsShutter(section_of("EpicsShutterKeys", FoundShutter, declared(ShutterPvs) | _KIND)):  # type: ignore[misc]
     """A shutter behind EPICS process variables."""
-
-    kind: Literal["epics"]
-
-    @property
-    def pvs(self) -> ShutterPvs:
-        """In the driver's terms."""
-        pvs: ShutterPvs = read_from(self, ShutterPvs)
-        return pvs
 
     def connect(self, clock: Clock) -> PvShutter:
         """See `FoundShutter`."""
-        return PvShutter(self.pvs, clock)
+        return PvShutter(read_from(self, ShutterPvs), clock)
 
 
-class EpicsFilter(FoundFilter):
+class EpicsFilter(section_of("EpicsFilterKeys", FoundFilter, _KIND | declared(FilterPvs))):  # type: ignore[misc]
     """Filters behind EPICS process variables, each as pva://NAME or ca://NAME."""
 
-    kind: Literal["epics"]
-    pv: PvUrl
-    """Takes the value of a place: a number, a text or a label."""
-    status_pv: PvUrl | None = None
-    """Where the filter itself is read, with the same values; null: pv."""
     places: Annotated[dict[Name, float | str], Field(min_length=1)]
     """Name: value."""
-    timeout_s: Seconds = 2.0
-    """For an answer of the IOC."""
-    travel_s: Seconds = 30.0
-    """The longest that the status may take to follow."""
 
     @model_validator(mode="after")
     def _one_value_a_place(self) -> Self:
@@ -62,30 +43,11 @@ class EpicsFilter(FoundFilter):
 
     def connect(self, clock: Clock) -> PvFilter:
         """See `FoundFilter`."""
-        status = self.status_pv or self.pv
-        return PvFilter(FilterPvs(self.pv, status, self.places, self.timeout_s, self.travel_s), clock)
+        return PvFilter(read_from(self, FilterPvs), clock)
 
 
-class EpicsMonochromator(FoundMonochromator):
+class EpicsMonochromator(section_of("EpicsMonoKeys", FoundMonochromator, _KIND | declared(MonochromatorPvs))):  # type: ignore[misc]
     """A monochromator behind EPICS process variables, each as pva://NAME or ca://NAME."""
-
-    kind: Literal["epics"]
-    pv: PvUrl
-    """Takes the energy."""
-    status_pv: PvUrl
-    """Where the energy itself is read."""
-    stop_pv: PvUrl | None = None
-    """Takes a 1 that stops it; null: it cannot be stopped."""
-    unit: Literal["keV", "eV"] = "keV"
-    """Of pv and status_pv."""
-    tolerance_ev: Annotated[float, Field(gt=0, le=1e4)] = 0.5
-    """Most difference of the energy from the one that was asked for."""
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """Time that it must stay within tolerance_ev before the move has ended."""
-    timeout_s: Seconds = 2.0
-    """Longest wait for an answer of the IOC."""
-    travel_s: Seconds = 60.0
-    """The longest that a move may take."""
 
     @property
     def stops(self) -> bool:
@@ -93,8 +55,4 @@ class EpicsMonochromator(FoundMonochromator):
 
     def connect(self, clock: Clock) -> PvMonochromator:
         """See `FoundMonochromator`."""
-        pvs = MonochromatorPvs(
-            self.pv, self.status_pv, self.stop_pv, per_kev=1e3 if self.unit == "eV" else 1.0,
-            tolerance=self.tolerance_ev * 1e-3, settle=self.settle_s, timeout=self.timeout_s, travel=self.travel_s,
-        )  # fmt: skip
-        return PvMonochromator(pvs, clock)
+        return PvMonochromator(read_from(self, MonochromatorPvs), clock)

@@ -84,7 +84,7 @@ def test_the_speed_of_a_search_is_the_configured_one_or_a_tenth_of_the_fastest(r
     "settings", [{"home_speed": 100.0}, {"home_speed": 0.0}, {"home": math.nan}, {"home": -math.inf}]
 )
 def test_settings_of_a_search_that_cannot_be_are_refused(rig: Rig, settings: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"search for home|home switch"):
+    with pytest.raises(ValueError, match=r"search for home|home switch|home(_speed)? is (0.0|nan|-inf)"):
         rig.open(**settings)
     rig.open().close()
 

@@ -89,7 +89,6 @@ def test_a_controller_with_fewer_triggers_is_noticed() -> None:
         {"width": 0.0015},
         {"width": math.nan},
         {"starter": 2},
-        {"output": 0},
         {"chained": False, "fires_when_enabled": True},
     ],
 )
