@@ -13,18 +13,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.beam import BeamMonitorSection, SceneMonochromator, StageOutputShutter
+from beamline.config.beam import (
+    BeamMonitorSection,
+    MotorFilter,
+    NoFilter,
+    SceneMonochromator,
+    StageMover,
+    StageOutputShutter,
+)
 from beamline.config.devices import SimulatedOrca
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
-from beamline.config.places import MotorFilter, NoFilter, StageMover
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
-from drivers.manual import ManualFilter
-from drivers.shutter import OutputShutter
+from drivers.in_beam import ManualFilter, OutputShutter
 from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
@@ -64,8 +69,13 @@ def simulated_devices(
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
     from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
-    from simulators.devices.monochromator import SimulatedMonochromator
-    from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
+    from simulators.devices.shutter import (
+        MovedSample,
+        SimulatedMonochromator,
+        SimulatedSampleMover,
+        SimulatedShutter,
+        WiredShutter,
+    )
     from simulators.devices.trigger_line import TriggerLine
 
     scene = scene_of(config)

@@ -13,10 +13,8 @@ import pytest
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Filter
 from drivers.epics.devices import FilterPvs, PvFilter
-from drivers.manual import ManualFilter
-from drivers.places import PlacedStage, StagePlaces
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.in_beam import ManualFilter, PlacedStage, StagePlaces
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, record_of, serve_pva

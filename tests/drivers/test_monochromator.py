@@ -12,9 +12,9 @@ import pytest
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Monochromator, Watchable
 from drivers.epics.devices import EnergyUnit, MonochromatorPvs, PvMonochromator
-from drivers.manual import ManualMonochromator
+from drivers.in_beam import ManualMonochromator
 from simulators.devices.clock import VirtualClock
-from simulators.devices.monochromator import SimulatedMonochromator
+from simulators.devices.shutter import SimulatedMonochromator
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
 
 ENERGIES = (8.3, 8.34, 8.3485, 8.3)

@@ -11,15 +11,62 @@ import contextlib
 import math
 from contextlib import closing
 from dataclasses import dataclass
-from typing import NoReturn
+from enum import StrEnum
+from typing import ClassVar, NoReturn
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import DigitalOutput, TriggerTrain
+from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
-from drivers.stages.epics.settings import EpicsSettings, Search
-from drivers.stages.kept import FoundSettings
-from drivers.stages.shared import LineStage, found_at_opening, until_standing, while_it_moves
+from drivers.flat import Declared
+from drivers.stages.settings import StageFigures, Wiring, key
+from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
+
+
+class Search(StrEnum):
+    """The direction in which the record searches its reference."""
+
+    NONE = "none"
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+    @property
+    def field(self) -> str:
+        """Field of the record that begins the search."""
+        return {"none": "", "forward": ".HOMF", "reverse": ".HOMR"}[self]
+
+
+@dataclass(frozen=True)
+class EpicsSettings(Declared):
+    """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
+
+    `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key
+    says deg.
+    """
+
+    pulse_output: ClassVar[None] = None
+    """A motor record sets no output."""
+    wiring: ClassVar[Wiring] = Wiring()
+    """No cable: only checks of trigger pulses ask for it."""
+    figures: StageFigures
+    unit: str = key("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
+    search: Search = key(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
+    tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0)
+
+    def limits(self) -> StageLimits:
+        """See `StageSettings`."""
+        figures = self.figures
+        return StageLimits(
+            figures.counts_per_turn,
+            figures.max_speed,
+            figures.acceleration,
+            figures.low,
+            figures.high,
+            False,
+            tolerance=self.tolerance,
+        )
+
 
 HOMED = 0x4000 | 0x0080
 """MSTA: the reference was found, or it stands there."""

@@ -12,9 +12,67 @@ import math
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, TriggerTrain
-from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
+from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 from drivers.stages.pm16c.settings import MODES, PM16CSettings, points_of
 from drivers.stages.shared import LineStage, found_at_opening, until_standing
+
+
+class HomeSearch:
+    """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
+
+    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
+    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
+    speed is the selected one. A search that has found the switch may end some counts beyond it.
+
+    Args:
+        home: the count that the reference gets.
+    """
+
+    def __init__(self, channel: PM16CChannel, name: str, home: int) -> None:
+        self._channel, self._name, self._home = channel, name, home
+        self._found: int | None = None
+        self._cancelled = False
+
+    def begin(self, speed: int) -> None:
+        """Start to search at `speed` pulses/s."""
+        self._channel.find_home(speed)
+
+    def cancel(self) -> None:
+        """End the search: no further step. Call it before the stop is sent, from any thread."""
+        self._cancelled = True
+
+    def go_on(self, status: ChannelStatus) -> bool:
+        """Take the next step after the motor has come to rest; False if there is none.
+
+        Raises:
+            DeviceError: the search ended without the switch, or was stopped.
+        """
+        home = self._channel.home() if self._found is None else self._found
+        if home is None or self._cancelled or status.stopped:
+            raise self._failed(status)
+        if self._found is None and status.counts != home:
+            self._found = home
+            try:
+                self._channel.go_home(home)
+            finally:
+                if self._cancelled:  # the stop may have gone out just before the move
+                    self._channel.stop(hard=False)
+            return True
+        if status.counts != home:
+            raise self._failed(status)
+        self._channel.preset(self._home)
+        return False
+
+    def _failed(self, status: ChannelStatus) -> DeviceError:
+        why = status.ending or ("stopped" if self._cancelled else "no reason given")
+        return DeviceError(
+            self._name,
+            f"the search for the home switch stopped short ({why})",
+            reply=status.raw,
+            expected="to stand on the home switch",
+            advice="Check the switch and its settings on the controller's panel, then search again",
+            state=f"It stands at {status.counts} counts, which are not those of the reference",
+        )
 
 
 class PM16CStage(LineStage):

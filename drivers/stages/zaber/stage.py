@@ -18,8 +18,7 @@ from drivers.stages.shared import LineStage, found_at_opening, refuse_another, u
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
-from drivers.stages.zaber.settings import ZaberSettings
-from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
+from drivers.stages.zaber.settings import PulseSettings, ZaberSettings, has_started, remaining, set_up
 
 ADVICE = (
     "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "

@@ -15,7 +15,7 @@ from typing import Self
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.epics.channel import OPENERS, PvValue
-from drivers.stages.epics.settings import EpicsSettings
+from drivers.stages.epics.stage import EpicsSettings
 from simulators.devices.motor import Ended, PulseMotor
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import SCHEME, plugged

@@ -14,8 +14,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, open_channel
 from drivers.epics.devices import FilterPvs, PvFilter, PvShutter, PvSource, ShutterPvs
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from tests.drivers.soft_ioc import PREFIX
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
