@@ -13,18 +13,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.beam import BeamMonitorSection, SceneMonochromator, StageOutputShutter
+from beamline.config.beam import (
+    BeamMonitorSection,
+    MotorFilter,
+    NoFilter,
+    SceneMonochromator,
+    StageMover,
+    StageOutputShutter,
+)
 from beamline.config.devices import SimulatedOrca
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
-from beamline.config.places import MotorFilter, NoFilter, StageMover
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
-from drivers.manual import ManualFilter
-from drivers.shutter import OutputShutter
+from drivers.in_beam import ManualFilter, OutputShutter
 from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     from simulators.devices.trigger_line import TriggerLine
     from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
+    from simulators.wires.wire import Controller
 
 
 @dataclass(frozen=True)
@@ -63,21 +69,20 @@ def simulated_devices(
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
     from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
-    from simulators.devices.monochromator import SimulatedMonochromator
-    from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
+    from simulators.devices.shutter import (
+        MovedSample,
+        SimulatedMonochromator,
+        SimulatedSampleMover,
+        SimulatedShutter,
+        WiredShutter,
+    )
     from simulators.devices.trigger_line import TriggerLine
-    from simulators.wires.registry import WIRES
-    from simulators.wires.serial_url import register
 
     scene = scene_of(config)
     line = TriggerLine(clock)
-    chosen, wanted = config.devices.stage, config.devices.shutter
-    try:
-        controller = WIRES[chosen.kind].matching(chosen.settings).controller(clock, line)
-    except ValueError as error:
-        raise ConfigError(f"devices.stage.{error}. Nothing was started.") from error
-    # A name of its own for every connection: two in one process must not share a controller.
-    stage = chosen.connect(clock, register(f"{chosen.kind}-{uuid4().hex}", controller))
+    wanted = config.devices.shutter
+    controller, url = _wire("stage", config.devices.stage, clock, line)
+    stage = config.devices.stage.connect(clock, url)
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
     blade: BeamGate = shutter
@@ -90,12 +95,12 @@ def simulated_devices(
     sample = inside = SimulatedSampleMover()
     if isinstance(mover := config.devices.sample_mover, StageMover):
         axis = TriggerLine(clock)
-        sample = motor = mover.connect(clock, _wire(mover.stage, clock, axis))
+        sample = motor = mover.connect(clock, _wire("sample_mover.stage", mover.stage, clock, axis)[1])
         opened.callback(motor.close)
         inside = MovedSample(axis, math.radians(mover.in_deg))
     changer: Filter | None = None
     if isinstance(wheel := config.devices.filter, MotorFilter):
-        changer = turned = wheel.connect(clock, _wire(wheel.stage, clock, TriggerLine(clock)))
+        changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
         opened.callback(turned.close)
     elif not isinstance(wheel, NoFilter):  # its light is that of the scene
         changer = ManualFilter(lambda request: None)
@@ -113,13 +118,19 @@ def simulated_devices(
     return Devices(stage, camera, shutter, sample, changer, monochromator), known
 
 
-def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:
-    """The port of a simulated controller that turns `axis`. Two in one process must not share one."""
+def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
+    """A simulated controller that turns `axis`, and its port. Two in one process must not share one.
+
+    ConfigError: it lacks what the section of the device asks for.
+    """
     from simulators.wires.registry import WIRES
     from simulators.wires.serial_url import register
 
-    controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
-    return register(f"{stage.kind}-{uuid4().hex}", controller)
+    try:
+        controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
+    except ValueError as error:
+        raise ConfigError(f"devices.{device}.{error}. Nothing was started.") from error
+    return controller, register(f"{stage.kind}-{uuid4().hex}", controller)
 
 
 def scene_of(config: Config, energy: float | None = None) -> Scene:

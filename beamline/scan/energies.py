@@ -34,7 +34,7 @@ from beamline.scan.runs import describe
 from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file
 from drivers.base.clock import SystemClock
-from drivers.manual import Ask
+from drivers.in_beam import Ask
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,8 @@ import pytest
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Filter
 from drivers.epics.devices import FilterPvs, PvFilter
-from drivers.manual import ManualFilter
-from drivers.places import PlacedStage, StagePlaces
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.in_beam import ManualFilter, PlacedStage, StagePlaces
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import register
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, record_of, serve_pva
@@ -78,7 +76,9 @@ def _behind_pvs(choices: dict[str, tuple[str, ...]], places: dict[str, float | s
         served = Variables({"wanted": 0.0, "is": 3.0}, choices, follow=follow)
         opened.enter_context(serve_pva(served, clock, patch))
         url = f"pva://{PREFIX}"
-        changer = PvFilter(FilterPvs(f"{url}wanted", f"{url}is", places, 5.0, travel=4.0), clock)
+        changer = PvFilter(
+            FilterPvs(pv=f"{url}wanted", status_pv=f"{url}is", places=places, timeout=5.0, travel=4.0), clock
+        )
         opened.callback(changer.close)
         return Rig(changer, lambda: len(written), lambda: stuck.append(True))
 

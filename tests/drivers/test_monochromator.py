@@ -11,10 +11,10 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Monochromator, Watchable
-from drivers.epics.devices import MonochromatorPvs, PvMonochromator
-from drivers.manual import ManualMonochromator
+from drivers.epics.devices import EnergyUnit, MonochromatorPvs, PvMonochromator
+from drivers.in_beam import ManualMonochromator
 from simulators.devices.clock import VirtualClock
-from simulators.devices.monochromator import SimulatedMonochromator
+from simulators.devices.shutter import SimulatedMonochromator
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
 
 ENERGIES = (8.3, 8.34, 8.3485, 8.3)
@@ -70,8 +70,10 @@ def _behind_pvs(per_kev: float, error_ev: float) -> Callable[..., Rig]:
 
         served = Variables({"wanted": 0.0, "is": 7.0 * per_kev, "stop": 0.0}, {}, follow=follow)
         opened.enter_context(serve_pva(served, clock, patch))
-        names = [f"pva://{PREFIX}{name}" for name in ("wanted", "is", "stop")]
-        device = PvMonochromator(MonochromatorPvs(*names, per_kev, timeout=5.0, travel=4.0), clock)
+        names = {"pv": "wanted", "status_pv": "is", "stop_pv": "stop"}
+        urls = {name: f"pva://{PREFIX}{variable}" for name, variable in names.items()}
+        unit = EnergyUnit.EV if per_kev == 1000 else EnergyUnit.KEV
+        device = PvMonochromator(MonochromatorPvs(**urls, unit=unit, timeout=5.0, travel=4.0), clock)
         opened.callback(device.close)
         rig = Rig(device, lambda: written, lambda: stuck.append(True), exact=error_ev == 0)
         rig.served = served  # type: ignore[attr-defined]

@@ -17,7 +17,7 @@ from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
 from beamline.scan.run import run_scan
 from drivers.base.errors import DeviceError
-from drivers.places import PlacedStage
+from drivers.in_beam import PlacedStage
 from tests.beamline import ran
 from tests.beamline.ball_scan import COMMON, shipped, small
 from tests.beamline.fakes import FakeInstrument

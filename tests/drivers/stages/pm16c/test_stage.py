@@ -61,7 +61,7 @@ def test_another_controller_on_the_port_is_named() -> None:
 
 @pytest.mark.parametrize("channel", [-1, 16])
 def test_a_channel_that_does_not_exist_is_refused(rig: Rig, channel: int) -> None:
-    with pytest.raises(ValueError, match="0 to 15"):
+    with pytest.raises(ValueError, match=r"channel is .*>= 0 and <= 15"):
         rig.open(channel=channel)
 
 
@@ -128,7 +128,7 @@ def test_a_chosen_width_is_the_one_set_and_a_single_pulse_may_be_wide(rig: Rig) 
 
 def test_what_cannot_be_set_is_refused_before_anything_is_sent(rig: Rig) -> None:
     for settings in ({"pulse_width": 5e-3}, {"pulse_width": math.nan}, {"active_high": False}):
-        with pytest.raises(ValueError, match=r"no pulses of|has one polarity"):
+        with pytest.raises(ValueError, match=r"no pulses of|has one polarity|pulse_width is nan"):
             rig.open(**settings)
     assert rig.controller.queries == 0
 
