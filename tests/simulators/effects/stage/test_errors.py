@@ -178,7 +178,7 @@ RUNOUT_ANGLES = np.linspace(-2.0, 5.0, 9)
 
 def test_one_wave_a_turn_is_a_sample_that_stands_beside_the_axis() -> None:
     """At phase φ it stands at (cos φ, -sin φ) beside it: exactly, at every angle."""
-    wandering = seen(posed(Runout(radial=((1, 12.0, 25.0),)), RUNOUT_ANGLES, rows=9), np.array(POINT))
+    wandering = seen(posed(Runout(radial=((1, 12.0, 25.0),)), RUNOUT_ANGLES, rows=9), POINT)
     beside = np.array(POINT) + 0.012 * np.array([math.cos(math.radians(25.0)), -math.sin(math.radians(25.0)), 0.0])
     np.testing.assert_allclose(wandering, seen(Pose.turned(RUNOUT_ANGLES, 9), beside), atol=1e-14)
 
@@ -188,7 +188,7 @@ def test_zero_waves_shift_the_axis_and_others_are_cosines() -> None:
         seen(
             posed(Runout(((0, 3.0, 0.0), (3, 2.0, 10.0)), ((2, 5.0, -40.0),)), RUNOUT_ANGLES, rows=9), np.array(POINT)
         ),
-        seen(Pose.turned(RUNOUT_ANGLES, 9), np.array(POINT)),
+        seen(Pose.turned(RUNOUT_ANGLES, 9), POINT),
     )
     at = 3 * RUNOUT_ANGLES + math.radians(10.0)
     across, along = 3.0 + 2.0 * np.cos(at), -2.0 * np.sin(at)
