@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from simulators.devices.camera import SimulatedOrcaQuest
     from simulators.devices.shutter import BeamGate, SampleGate
     from simulators.devices.trigger_line import TriggerLine
-    from simulators.effects.anomaly import Label
+    from simulators.effects.chain import Label
     from simulators.scenes.scene import Scene
     from simulators.wires.wire import Controller
 

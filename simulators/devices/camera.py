@@ -21,7 +21,7 @@ from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, Tr
 from simulators.devices.camera_view import CameraView, Exposed
 from simulators.devices.shutter import BeamGate, SampleGate
 from simulators.devices.trigger_line import TriggerLine
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError
