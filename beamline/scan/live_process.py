@@ -25,98 +25,10 @@ from beamline.core.events import (
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, ProcessEnd, json_object
 from beamline.core.stop import StopRequest
-from beamline.core.text import count, size
 from beamline.instrument.connect import describe
-from beamline.plan.angles import one_way
-from beamline.plan.plan import Mode, ScanPlan
+from beamline.scan.live_plan import LivePlan, live_plan
 from recon.base.choices import AUTO
 from recon.methods import streams
-
-# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
-_A_RAY, _A_VOXEL = 40, 50
-_WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
-_FEWEST = 90  # views
-_SHARE = 0.5  # share of the free memory
-_PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
-_SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
-"""dB of the live volume after a quarter, half and three quarters: 90 views of particles (docs/notes/performance.md)."""
-
-
-@dataclass(frozen=True)
-class LivePlan:
-    """The part of a scan that its live volume uses."""
-
-    binning: int = 1  # binning of rows and columns
-    every: int = 1  # one of so many views, in the order taken
-    bytes: int = 0  # of memory, about
-
-    @property
-    def whole(self) -> bool:
-        return self.binning == self.every == 1
-
-
-def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Binning, and views left out, so that the live volume has at most 512 columns and half of the free memory.
-
-    Views are left out as long as 90 are used, then the binning grows.
-
-    Args:
-        shape: rows and columns of a frame.
-        free: bytes of memory.
-    """
-    binning = 1
-    while shape[1] > _WIDEST * binning:
-        binning *= 2
-    while True:
-        volume = live_bytes(shape, 0, binning)
-        view, room = live_bytes(shape, 1, binning) - volume, _SHARE * free - volume
-        most = max(1, int(room // view)) if room > 0 else 1
-        every = math.ceil(n_views / most)
-        used = math.ceil(n_views / every)
-        if used >= min(n_views, _FEWEST) or shape[1] // binning < 32:
-            return LivePlan(binning, every, volume + used * view)
-        binning *= 2
-
-
-def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that names an order of views with a better live volume before the end; empty if the plan has it."""
-    angles = plan.angles[:: plan.frames_per_view]
-    if not one_way(angles) or angles.size < _FEWEST:
-        return ()
-    if plan.mode is Mode.STEP:
-        other, expected = "{scheme: golden}", _GOLDEN
-    elif passes := next((n for n in _PASSES if angles.size % n == 0), 0):
-        other, expected = f"{{scheme: interlaced, passes: {passes}}}", _INTERLACED
-    else:
-        return ()
-    return (
-        "until the last view the live volume knows a sector: after a quarter, half and three quarters of a scan of "
-        f"particles it has {_SEQUENTIAL} dB, by scan.angles {other} {expected} dB, and in the end the same",
-    )
-
-
-def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
-    """Estimated memory in bytes of a live volume of so many views, rows and columns."""
-    rows, cols = (max(1, n // binning) for n in shape)
-    return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
-
-
-def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
-    """A sentence on the live volume: its views and pixels, its memory, and the reason for its size."""
-    plan = live_plan(shape, n_views, free)
-    rows, cols = (max(1, n // plan.binning) for n in shape)
-    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
-    need = (
-        f"the live volume is of {count(views, 'view')} of {rows} x {cols} pixels, in about {size(plan.bytes)} of memory"
-    )
-    if plan.whole:
-        return f"{need}; it may take {most}"
-    how = [f"one view of {plan.every}"] if plan.every > 1 else []
-    how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
-    whole = f"all {n_views} of {shape[0]} x {shape[1]} would take {size(live_bytes(shape, n_views))}"
-    wide = f"at most {_WIDEST} columns, and " if shape[1] > _WIDEST else ""
-    return f"{need}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
-
 
 if TYPE_CHECKING:
     from beamline.scan.resume import ResumableRun

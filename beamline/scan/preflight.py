@@ -30,7 +30,7 @@ from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import duration_text, work_out
-from beamline.scan.live_process import better_order, live_need
+from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource

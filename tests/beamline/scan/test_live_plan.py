@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from beamline.config.load import config_folder, load, plan_of
-from beamline.scan.live_process import better_order, live_need, live_plan
+from beamline.scan.live_plan import better_order, live_need, live_plan
 
 
 @pytest.mark.parametrize(
