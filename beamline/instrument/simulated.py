@@ -35,11 +35,12 @@ from recon.base.registry import in_folders
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
     from simulators.devices.camera import SimulatedOrcaQuest
-    from simulators.devices.shutter import BeamGate, SampleGate
     from simulators.devices.trigger_line import TriggerLine
     from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
     from simulators.wires.wire import Controller
+
+IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,9 @@ def simulated_devices(
     """
     from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
     from simulators.devices.shutter import (
-        MovedSample,
         SimulatedMonochromator,
         SimulatedSampleMover,
         SimulatedShutter,
-        WiredShutter,
     )
     from simulators.devices.trigger_line import TriggerLine
 
@@ -85,19 +84,21 @@ def simulated_devices(
     stage = config.devices.stage.connect(clock, url)
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
-    blade: BeamGate = shutter
+    beam_is_on = shutter.is_open
     if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
         number, output = wanted.output, stage.digital_output(wanted.output)
         shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
-        blade = WiredShutter(lambda: controller.output_is_high(number), wanted.open_high)
+        open_high = wanted.open_high
+        beam_is_on = lambda: controller.output_is_high(number) is open_high  # noqa: E731
     sample: SampleMover
-    inside: SampleGate
-    sample = inside = SimulatedSampleMover()
+    sample = simulated = SimulatedSampleMover()
+    sample_is_in = simulated.is_in
     if isinstance(mover := config.devices.sample_mover, StageMover):
         axis = TriggerLine(clock)
         sample = motor = mover.connect(clock, _wire("sample_mover.stage", mover.stage, clock, axis)[1])
         opened.callback(motor.close)
-        inside = MovedSample(axis, math.radians(mover.in_deg))
+        inside = math.radians(mover.in_deg)
+        sample_is_in = lambda: abs(axis.angle_at(clock.now()) - inside) < IN_PLACE  # noqa: E731
     changer: Filter | None = None
     if isinstance(wheel := config.devices.filter, MotorFilter):
         changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
@@ -107,7 +108,7 @@ def simulated_devices(
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     build = OrcaQuestBuild(pixel_pitch=pitch, model=model)
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, build)
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, beam_is_on, sample_is_in, build)
     opened.callback(camera.close)
     monochromator: Monochromator | None = None
     if isinstance(section := config.devices.monochromator, SceneMonochromator):
