@@ -13,7 +13,7 @@ import pytest
 
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.base.protocols import Camera, CameraFrame, TriggerSource
+from drivers.base.protocols import CameraFrame, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
@@ -78,11 +78,6 @@ class TestConformance(CameraConformance):
 
     def test_its_conversion_is_that_of_an_orca(self, bench: CameraBench) -> None:
         says_what_an_orca_says(bench)
-
-
-def test_is_a_camera() -> None:
-    camera: Camera = _Bench().camera  # checked by mypy
-    assert camera.name == "camera"
 
 
 def test_dark_flat_and_projection_follow_shutter_and_sample() -> None:
