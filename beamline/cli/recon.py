@@ -257,7 +257,8 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 def dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
-    from beamline.core.machine import MachineSpeed, busy
+    from beamline.core.machine import busy
+    from beamline.core.machine_speed import MachineSpeed
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sink:

@@ -30,7 +30,7 @@ from beamline.core.events import (
     TrialReached,
     VolumeDone,
 )
-from beamline.core.machine import seconds_left
+from beamline.core.machine_speed import seconds_left
 from beamline.core.sinks import sentence
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable

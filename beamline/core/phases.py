@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from beamline.core.events import PhaseReached, Sink
-from beamline.core.machine import seconds_left
+from beamline.core.machine_speed import seconds_left
 from drivers.base.clock import Clock, SystemClock
 
 _SAY_EVERY = 0.2  # s between events on the progress of a phase

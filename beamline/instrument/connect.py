@@ -30,7 +30,6 @@ from beamline.config.beam import (
 from beamline.config.devices import DcamOrca, SimulatedOrca
 from beamline.config.load import Config, camera_settings
 from beamline.core.errors import ConfigError
-from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_beam_monitor, simulated_devices
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (
     BeamMonitor,
@@ -90,6 +89,7 @@ def enter_pressed() -> bool:
 
 
 if TYPE_CHECKING:
+    from beamline.instrument.simulated import SimulatedScene
     from recon.base.volume import Grid, Volume
 
 
@@ -140,8 +140,11 @@ def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
     Raises:
         DeviceError: its port does not open.
     """
-    name = config.counterpart if config.simulated else None
-    return config.connect(clock, None if name is None else simulated_beam_monitor(name, config, clock))
+    if not config.simulated or config.counterpart is None:
+        return config.connect(clock, None)
+    from beamline.instrument.simulated import simulated_beam_monitor
+
+    return config.connect(clock, simulated_beam_monitor(config.counterpart, config, clock))
 
 
 @dataclass(frozen=True)
@@ -204,6 +207,8 @@ def connect(
                 monochromator=_monochromator(config, clock, ask, opened),
             )
         else:
+            from beamline.instrument.simulated import clock_of, simulated_devices
+
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
@@ -243,6 +248,8 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     """
     limits = config.devices.stage.settings.limits()
     if config.simulation is not None:
+        from beamline.instrument.simulated import scene_of
+
         scene_of(config, config.scan.energy)
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import recon
 from beamline.core.errors import DataError
 from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
-from beamline.core.machine import seconds_left
+from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope

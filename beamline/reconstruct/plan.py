@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Counted, Sink, StateEntered
-from beamline.core.machine import Need, seconds_left
+from beamline.core.machine import Need
+from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size

@@ -30,7 +30,6 @@ from beamline.core.sinks import Announcer, JsonLines, UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
-from beamline.instrument.simulated import clock_of
 from beamline.plan.angles import Retake, spread_retakes
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
@@ -154,6 +153,8 @@ def _clock(config: Config, series: ResumableRun | None) -> Clock | None:
     """A clock that goes on where the simulated one of the run stopped, as it starts anew in each process; else None."""
     if series is None or config.simulation is None:
         return None
+    from beamline.instrument.simulated import clock_of
+
     return clock_of(config.simulation.clock, not_before=series.last_frame_time)
 
 

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import serial
 from serial.tools import list_ports
@@ -319,22 +319,3 @@ class SerialLine:
 
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
         return kind(self._device, problem, wire=self._transcript.recent(), **parts)
-
-
-class Wired(Protocol):
-    """Connection of a controller; a stage's `Wiring` implements it."""
-
-    @property
-    def timeout(self) -> float: ...
-
-    @property
-    def baudrate(self) -> int: ...
-
-    @property
-    def transcript(self) -> Path | None: ...
-
-
-def line_to(wiring: Wired, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
-    given: dict[str, Any] = {"timeout": wiring.timeout, "baudrate": wiring.baudrate, "transcript": wiring.transcript}
-    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **given)

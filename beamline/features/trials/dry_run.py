@@ -14,7 +14,8 @@ import psutil
 
 from beamline.cli.terminal import events_shown
 from beamline.core.events import Done
-from beamline.core.machine import MachineSpeed, Need, free_memory
+from beamline.core.machine import Need, free_memory
+from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn, Warnings
 from beamline.core.text import count, size
 from beamline.features.trials.launch import TrialData

@@ -22,7 +22,7 @@ LOST = [
     *(("pm16c", "search", lost, "", lost) for lost in ("TMGC", "SPDH", "FDHP")),
     *(("pm16c", "end of a search", lost, "", lost) for lost in ("GTHP", "PSB")),
     *(("pi_gcs", "open", lost, "", NOT_TAKEN.format(lost)) for lost in ("ACC 1 60", "DEC 1 60", "SVO 1 1")),
-    *(("pi_gcs", "move", lost, "", f"was not taken.*{lost}") for lost in ("VEL 1 10", "MOV 1 30")),
+    *(("pi_gcs", "move", lost, "", f"was not taken.*{lost}") for lost in ("VEL 1 20", "MOV 1 30")),
     *(
         ("pi_gcs", "arm", sent, arrives, rf"{sent}.*Nothing has moved")
         for sent, arrives in (
@@ -64,7 +64,7 @@ def test_a_command_lost_on_the_way_is_noticed_and_nothing_moves_or_is_emitted(
     if act == "end of a search" and kind == "pi_gcs":
         stage.start_home()
     calls = {
-        "move": lambda: stage.start_move(math.radians(30), SPEED),
+        "move": lambda: stage.start_move(math.radians(30), SPEED if kind == "pm16c" else 2 * SPEED),
         "arm": lambda: stage.arm(train),
         "disarm": stage.disarm,
         "search": stage.start_home,

@@ -240,15 +240,6 @@ def test_a_limit_switch_is_named(degrees: float, side: str) -> None:
         stage.wait(LONG)
 
 
-def test_a_stop_from_another_program_is_named(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_move(math.radians(30), SPEED)
-    rig.clock.sleep(1.0)
-    rig.say("STP")
-    with pytest.raises(DeviceError, match="error 10, stopped by command"):
-        stage.wait(LONG)
-
-
 def test_limits_that_another_program_narrowed_are_the_controllers_to_name() -> None:
     rig = Rig(low=-5.0, high=200.0)
     stage = rig.open(low=math.radians(-5), high=math.radians(200))
@@ -288,3 +279,18 @@ def test_the_configured_serial_number_is_required(rig: Rig) -> None:
     rig.open(serial=serial).close()
     with pytest.raises(DeviceRefused, match=rf"is {serial}.*swapped"):
         rig.open(serial="42")
+
+
+def test_other_outputs_can_be_set_and_that_of_the_pulses_cannot(rig: Rig) -> None:
+    stage = rig.open()
+    output = stage.digital_output(3)
+    assert output.name == "stage output 3"
+    output.set(True)
+    assert rig.controller.box.levels == {1: False, 2: False, 3: True, 4: False}
+    assert output.get() is None
+    output.set(False)
+    assert not rig.controller.box.levels[3]
+    with pytest.raises(DeviceRefused, match="output 2 gives"):
+        stage.digital_output(2)
+    with pytest.raises(DeviceRefused, match="DIO ended with"):
+        stage.digital_output(9).set(True)

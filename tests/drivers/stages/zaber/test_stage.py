@@ -160,15 +160,6 @@ def test_a_move_of_somebody_else_is_waited_for_or_named(rig: Rig) -> None:
     assert math.degrees(stage.wait(LONG)) == pytest.approx(20.0)
 
 
-def test_a_stop_is_named_by_its_flag(rig: Rig) -> None:
-    stage = rig.open()
-    stage.start_move(math.radians(90), SPEED)
-    rig.clock.sleep(1.0)
-    stage.stop()
-    with pytest.raises(DeviceError, match=r"stopped short.*movement interrupted \(NI\)"):
-        stage.wait(LONG)
-
-
 SLIPS = [
     ("WS", "stalled and recovered"),
     ("WM", "displaced while it stood"),
