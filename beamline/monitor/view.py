@@ -4,9 +4,9 @@ Made once a frame for all checks. The grid has 128 to 255 columns of square cell
 takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
 of the field.
 
-Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers):
-the largest pixel of a preview block if it is far brighter than the means of all blocks around it, beyond
-noise. It must also exceed that place in the previous frame, because hot pixels and bright gaps in the sample stay.
+Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel of
+a preview block if it is far brighter than the means of all blocks around it, beyond noise. It must also exceed that
+place in the previous frame, because hot pixels and bright gaps in the sample stay.
 """
 
 from __future__ import annotations
