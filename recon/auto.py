@@ -33,15 +33,8 @@ from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out import (
-    LEAST_VIEWS,
-    TRIAL_ROWS,
-    busiest_rows,
-    middle_of_cone,
-    slab_of,
-    split_views,
-    unseen_residuals,
-)
+from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of
+from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, split_views, unseen_residuals
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines

@@ -25,7 +25,7 @@ from recon.splatting.optimise import FitState, renders, settle, volume_of
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector
 
 HALF = 60.0  # steps after which the rates are half of the first ones

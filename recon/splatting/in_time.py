@@ -18,7 +18,15 @@ from recon.base.work import CLOCK, Costs, Rates, Work
 from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS, finish
 from recon.splatting.fit_method import FitMethod, StreamingMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import SCALED_BY, count_for, joined_for, sample_gaussians, start_method
+from recon.splatting.initialise import (
+    SCALED_BY,
+    count_for,
+    default_count,
+    joined_for,
+    sample_gaussians,
+    start_method,
+    sweeps_of_start,
+)
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
@@ -305,3 +313,31 @@ def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
     return Speeds(
         volume.seconds(rates), start.seconds(rates), step.seconds(rates), fill.seconds(rates), sweep, trials
     )  # fmt: skip
+
+
+_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
+
+
+def factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
+    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
+
+    Warns:
+        UserWarning: they do not suffice for a start from all pixels.
+    """
+    if isinstance(method.gaussians, Gaussians):
+        return 1
+    count = method.gaussians or default_count(geometry, grid.voxel_size)
+    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
+    needed += first_draw_seconds(grid, count, now)
+    remaining = max(end - now(), 0.0)
+    if needed <= remaining:
+        return 1
+    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
+    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
+    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
+    warnings.warn(
+        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
+        f"{then if factor > 1 else 'it ends late'}",
+        stacklevel=2,
+    )
+    return factor

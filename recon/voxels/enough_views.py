@@ -17,7 +17,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.iterative import solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector

@@ -20,7 +20,8 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import AT_AXIS, NARROWEST, ring_offsets, steadiness
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out import beyond_chance, busiest_rows, split_views
+from recon.voxels.field_edges import busiest_rows
+from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector

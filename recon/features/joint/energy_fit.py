@@ -18,7 +18,7 @@ from recon.base.volume import Grid
 from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.held_out import busiest_rows, slab_of
+from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue

@@ -20,7 +20,7 @@ from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.motion import Motion, Seen, improved, moved, weighed
 from recon.voxels.displacement import Displacement, displaced, displacements, judge, measured_unmagnified, unmagnified
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 
 _COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide

@@ -19,11 +19,11 @@ from recon.base.declared_types import Bound, Checked, Count, NonNegative, Positi
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
 from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume
-from recon.splatting.train import used_and_kept_back
 from recon.voxels.direct import direct_work
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.voxel_problem import iterative_memory
