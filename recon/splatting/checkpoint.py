@@ -140,7 +140,7 @@ class HeldOutTracker:
         best = {_BEST + name: values for name, values in self.kept.items()}
         return {"watch": np.array([self.best, self.best_step]), **best}
 
-    def look(self, state: FitState, keep: bool) -> None:
+    def measure(self, state: FitState, keep: bool) -> None:
         if self.problem is None:
             return
         self.value = fit.misfit_of(state, self.problem, self.settings)

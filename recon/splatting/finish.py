@@ -146,10 +146,10 @@ class _Planning:
 
     def of_fit(self, trial: HeldOutTrial, weight: float, strength: float, share: float) -> F64 | None:
         """Residuals [view held out] of a fit of the trial's views, refined with the prior; None: it refuses them."""
-        part, wide = trial.problem, trial.wide.seen()
-        seen, cols = wide.projector, trial.wide.cols
-        weights = None if wide.weight is None else projection_images(wide.weight)
-        views = ReconProblem(projection_images(wide.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
+        part, whole = trial.problem, trial.all_columns.seen()
+        seen, cols = whole.projector, trial.all_columns.cols
+        weights = None if whole.weight is None else projection_images(whole.weight)
+        views = ReconProblem(projection_images(whole.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -159,10 +159,10 @@ class _Planning:
             None if views is None else np.ascontiguousarray(projection_lines(views)[:, cols])
             for views in (
                 beyond_voxels(fitted.gaussians, geometry, fitted.volume.grid, self.settings)
-                for geometry in (seen.geometry, trial.wide.unseen)
+                for geometry in (seen.geometry, trial.all_columns.unseen)
             )
         )
-        refined = trial.made(
+        refined = trial.volume_by(
             lambda some, x: refine(
                 _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
             ),

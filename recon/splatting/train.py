@@ -315,7 +315,7 @@ def _steps(run: _Run) -> None:
                 expected = state.step + max(0.0, length.seconds - spent) / step
                 run.settings = in_steps(method.fit, min(expected, length.steps or expected))
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
-            run.tracker.look(state, method.early_stop)
+            run.tracker.measure(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
             run.report(reported)
@@ -325,7 +325,7 @@ def _steps(run: _Run) -> None:
         patience = max(6 * _LOOK, _PATIENCE * (length.steps or 0))
         if method.early_stop and state.step - run.tracker.best_step > patience:
             break
-    run.tracker.look(state, method.early_stop)
+    run.tracker.measure(state, method.early_stop)
     run.report(now())
 
 

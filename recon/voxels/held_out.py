@@ -88,14 +88,14 @@ def choice_sweeps(geometry: Geometry) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Preferred:
+class BestStrength:
     """The strength of a prior that views held out prefer, and the least residual in its search, of each [view]."""
 
     strength: float
     residuals: F64
 
 
-def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Preferred | None:
+def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> BestStrength | None:
     """The strength of a prior whose residual is least, sought in octaves from `first`.
 
     No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
@@ -129,7 +129,7 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Pr
     if octave - 1 in tried and octave + 1 in tried:
         weaker, stronger = mean(octave - 1) - mean(octave), mean(octave + 1) - mean(octave)
         vertex += (weaker - stronger) / (2 * (weaker + stronger)) if weaker + stronger > 0 else 0.0
-    return Preferred(first * 2.0**vertex, tried[octave])
+    return BestStrength(first * 2.0**vertex, tried[octave])
 
 
 def choose_weight(
@@ -151,14 +151,14 @@ def choose_weight(
         preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first)
         if judge is None or preferred is None:
             return [balance.first, balance.noise]
-        judge.keep("weight", preferred)
+        judge.remember("weight", preferred)
         return [preferred.strength]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], sweeps) if noise else first
 
 
-class WideViews(NamedTuple):
+class AllColumns(NamedTuple):
     """The rows of a trial with all columns, air beside the sample, too: a fit of narrower views is a poorer one.
 
     Attributes:
@@ -179,16 +179,16 @@ class HeldOutTrial:
         problem: of the slab.
         start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
         unseen: the views held out.
-        wide: both with all columns.
+        all_columns: both with all columns.
         direct: the first volume is FBP.
         smooth: the volume of total variation that predicts these best, of those made so far.
     """
 
     def __init__(
-        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, wide: WideViews, direct: bool
+        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns, direct: bool
     ) -> None:  # fmt: skip
         self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
-        self.wide, self.direct = wide, direct
+        self.all_columns, self.direct = all_columns, direct
         self._subsets = Subsets.of(problem, SUBSETS)
         self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
@@ -246,8 +246,8 @@ class HeldOutTrial:
             depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
         others, judges = split_views(views)
-        wide = WideViews(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
-        return cls(seen, np.maximum(first, 0, out=first) if direct else first, unseen, wide, direct)
+        all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
+        return cls(seen, np.maximum(first, 0, out=first) if direct else first, unseen, all_columns, direct)
 
     def _go_on(self, sweep: int, residual: float) -> bool:
         self._ended = self._ended or not self.problem.trial_goes_on()
@@ -261,29 +261,27 @@ class HeldOutTrial:
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
         """`residuals` of the volume of this prior and strength; kept, so that each volume is made once."""
         if (prior, strength) not in self._known:
-            self._known[prior, strength] = self.residuals(volume(strength))
+            x = volume(strength)
+            residuals = self._known[prior, strength] = self.residuals(x)
+            if prior == "weight" and residuals.mean() < self._least:
+                self.smooth, self._least = x, float(residuals.mean())
         return self._known[prior, strength]
 
-    def keep(self, prior: str, preferred: Preferred) -> None:
+    def remember(self, prior: str, preferred: BestStrength) -> None:
         """Take the least residual of a search as that of the strength it prefers."""
         self._known[prior, preferred.strength] = preferred.residuals
 
     def of_weight(self, weight: float) -> F64:
         """`residuals` of total variation with this weight; the best volume of all is kept as `smooth`."""
-        if ("weight", weight) not in self._known:
-            volume = self.with_weight(weight)
-            residuals = self._known["weight", weight] = self.residuals(volume)
-            if residuals.mean() < self._least:
-                self.smooth, self._least = volume, float(residuals.mean())
-        return self._known["weight", weight]
+        return self.residuals_of("weight", weight, self.with_weight)
 
     def with_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""
-        return self.made(lambda part, x: ordered_fista(
+        return self.volume_by(lambda part, x: ordered_fista(
             part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
         ))  # fmt: skip
 
-    def made(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
+    def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
         """The volume that `make` makes of the first one, which it may overwrite; that one where the trials ended."""
         x = (self.start if start is None else start).copy()
         if self._ended:

@@ -275,7 +275,7 @@ def choose_patches(
         found = preferred_strength(partial(residuals_of_patches, judge, smooth), first)
         if found is None:
             return [first, 0]
-        judge.keep("patches", found)
+        judge.remember("patches", found)
         return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
@@ -286,6 +286,8 @@ def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
     """What the volume that patches make of this one leaves of the views held out."""
 
     def made(strength: float) -> F32:
-        return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
+        return trial.volume_by(
+            lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x
+        )
 
     return trial.residuals_of("patches", strength, made)

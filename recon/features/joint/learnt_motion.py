@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.declared_types import check_arguments
+from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.motion import Motion, Seen, improved, moved, weighed
@@ -252,4 +253,4 @@ def _strengths(views: EnergyViews) -> F64:
 def _spread(energy: NDArray[np.intp]) -> NDArray[np.intp]:
     """Indices of views that are evenly spread, at most `_VIEWS` of each energy."""
     own = (np.flatnonzero(energy == e) for e in np.unique(energy))
-    return np.sort(np.concatenate([at[np.unique(np.linspace(0, at.size - 1, _VIEWS).astype(int))] for at in own]))
+    return np.sort(np.concatenate([spread(at, _VIEWS) for at in own]))

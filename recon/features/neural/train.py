@@ -217,7 +217,7 @@ class _Fit:
     def run(self, used: Places, kept: Places) -> None:
         method, now = self.method, self.control.now
         lit = [int(view) for view in used if self.views.usable(int(view), method.foreground).any()]
-        judges = self._judges(kept)
+        judges = self._judging_rays(kept)
         order: list[int] = []
         seconds = math.inf if method.seconds is None else method.seconds - (now() - self.begin)
         started, reported = now(), -math.inf
@@ -230,7 +230,7 @@ class _Fit:
             order = order or self.rng.permutation(lit).tolist()
             self._advance(order.pop(), method.rate * (_DROP if share >= _DROP_AT else 1.0))
             if judges and share * _LOOKS >= self.looks:
-                self._look(judges)
+                self._measure_held_out(judges)
             if now() - reported > 0.1:
                 reported = now()
                 self._report(len(used))
@@ -240,7 +240,7 @@ class _Fit:
                 break
         self.seconds_of_steps = now() - started
         if judges:
-            self._look(judges)
+            self._measure_held_out(judges)
         self._report(len(used))
         if self.best.network:
             self.network.load_state_dict(self.best.network)
@@ -275,14 +275,14 @@ class _Fit:
     def _tensor(self, values: F32) -> Tensor:
         return torch.from_numpy(values).to(self.device)
 
-    def _judges(self, kept: Places) -> list[tuple[int, Places]]:
+    def _judging_rays(self, kept: Places) -> list[tuple[int, Places]]:
         """Rays of views held out, the same at every look."""
         share = -(-_JUDGES // max(1, kept.size))
         pixels_of_views = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
         return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in pixels_of_views if pixels.size]
 
     @torch.no_grad()
-    def _look(self, judges: list[tuple[int, Places]]) -> None:
+    def _measure_held_out(self, judges: list[tuple[int, Places]]) -> None:
         middles = (np.arange(self.samples, dtype=np.float32) + np.float32(0.5)) / np.float32(self.samples)
         left = scale = 0.0
         for view, pixels in judges:
