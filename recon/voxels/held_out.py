@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
@@ -85,6 +86,25 @@ def choice_sweeps(geometry: Geometry) -> float:
     """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
+
+
+def predicted_views(
+    method: Method, data: F32, geometry: Geometry, grid: Grid, known: NDArray[Any] | None, one_in: int
+) -> tuple[NDArray[np.intp], F32]:
+    """Numbers of the views held out, one in so many by angle, and their images [view, row, col] by the others.
+
+    Args:
+        method: that makes the volume.
+        data: line integrals [view, row, col].
+        known: [row, col] weights of pixels; None: one for all.
+    """
+    order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
+    unseen = order[1::one_in]
+    seen = np.setdiff1d(order, unseen)
+    weights = None if known is None else np.broadcast_to(known, data[seen].shape).astype(np.float32)
+    part = ReconProblem(data[seen], geometry.select(seen), grid, DataUse(weights), 0, "cpu")
+    volume = method.run(part, RunControl()).volume
+    return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,12 +17,10 @@ from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
-from recon.voxels.held_out import beyond_chance
+from recon.voxels.held_out import beyond_chance, predicted_views
 from recon.voxels.methods import FistaTv
-from recon.voxels.projector import Projector
 
 _ONE_IN = 4  # views held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
@@ -50,16 +48,8 @@ class Judge:
 
     def deviations(self, geometry: Geometry) -> F64:
         """[view held out] root mean squares by a volume of the others in this geometry."""
-        order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
-        unseen = order[1::_ONE_IN]
-        rows = geometry.detector_shape[0]
-        seen = np.setdiff1d(order, unseen)
-        use = DataUse()
-        if self.known is not None:
-            use = DataUse(np.broadcast_to(self.known, self.views[seen].shape).copy())
-        problem = ReconProblem(self.views[seen], geometry.select(seen), self.grid, use, 0, "cpu")
-        volume = FistaTv(_SWEEPS, _TV_WEIGHT).run(problem, RunControl()).volume
-        images = Projector(geometry.select(unseen), self.grid).forward(volume.data)
+        method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
+        unseen, images = predicted_views(method, self.views, geometry, self.grid, self.known, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
         edge = min(_EDGE, (rows - 1) // 4)
         known[:edge], known[rows - edge :] = 0, 0
