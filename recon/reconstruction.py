@@ -37,7 +37,7 @@ def reconstruct(
     use: DataUse | None = None,
     control: RunControl | None = None,
 ) -> Reconstruction:
-    """Line integrals to a volume.
+    """Reconstruct a volume from line integrals.
 
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
@@ -89,7 +89,7 @@ def reconstruct(
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
-    """Of values that are not finite, but for those that weights leave out."""
+    """Warn of values that are not finite, except those that weights leave out."""
     lost = sum(
         int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
         for at, view in enumerate(data)

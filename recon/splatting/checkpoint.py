@@ -134,7 +134,7 @@ class HeldOutTracker:
         return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Its arrays in a checkpoint."""
+        """The tracker as arrays of a checkpoint."""
         if self.problem is None:
             return {}
         best = {_BEST + name: values for name, values in self.kept.items()}

@@ -95,7 +95,7 @@ def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
 
 
 class FinishPlan(NamedTuple):
-    """What a finish may take.
+    """Length of a finish: its sweeps, seconds and trials.
 
     Attributes:
         sweeps: of total variation; None: as many as it makes by default, and steps with sparse patches.
@@ -227,7 +227,7 @@ _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back 
 
 
 def covered(voxels: float, gaussians: float) -> float:
-    """In proportion to the pixels that Gaussians cover in a view, whose widths are their distances."""
+    """Proportional to the pixels that Gaussians cover in a view, as wide as their distances."""
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
@@ -256,7 +256,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
 
 
 def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
-    """From the first volume to that of the Gaussians."""
+    """Work from the first volume to the volume of the Gaussians."""
     cone = geometry.is_cone
     field = Grid.for_fit(geometry, grid)
     voxels, usual = math.prod(field.shape), count_for(field, cone)
@@ -275,13 +275,13 @@ def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
 
 
 def _view(method: FitMethod, geometry: Geometry, voxels: float, gaussians: float) -> Work:
-    """A view of a step of a fit."""
+    """Work of one view in a step of a fit."""
     reach = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
     return Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, gaussians) * reach**2)
 
 
 def _rendered(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
-    """All views of the Gaussians, and once more of what no voxels explain."""
+    """Work of rendering all views of the Gaussians, and once more the part that no voxels explain."""
     field = Grid.for_fit(geometry, grid)
     count = method.gaussians if isinstance(method.gaussians, int) else count_for(field, geometry.is_cone)
     return 2 * _RENDER * geometry.n_views * _view(method, geometry, math.prod(field.shape), count)

@@ -184,7 +184,7 @@ class _Update:
 def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
-    """What makes whole steps of this state on the device, kept from step to step while nothing changes its plan."""
+    """The fused step of this state on the device, kept from step to step while its plan stays."""
     shape, before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,

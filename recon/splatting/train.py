@@ -135,7 +135,7 @@ class _Views:
 
 @dataclass(eq=False)
 class _Length:
-    """How long a fit takes.
+    """Length of a fit, in steps or seconds.
 
     Attributes:
         steps: end the fit; None: only `seconds` end it.
@@ -152,12 +152,12 @@ class _Length:
     planned: bool
 
     def fraction(self, step: int, spent: float) -> float:
-        """How far the fit has come after so many steps and seconds, 0..1."""
+        """Share of the fit that is done after so many steps and seconds, 0..1."""
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
     def plan(self, plan: FinishPlan, spent: float) -> None:
-        """Keep time for the finish."""
+        """Reserve time for the finish."""
         self.sweeps, finishing, self.trials = plan
         self.planned = True
         if self.seconds is not None:
@@ -247,7 +247,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
 
 
 def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
-    """What a fit, and methods on voxels, leave of views held out."""
+    """Residuals of views held out by a fit and by methods on voxels."""
 
     def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
         share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]

@@ -36,7 +36,7 @@ class FieldEdges:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
-        """By up to 32 views, in the rows that hold matter.
+        """Edge levels of up to 32 views, in the rows that hold matter.
 
         Medians over views and rows: corners at some angles do not count. The least of the quarters: a beam drifts away
         from its flats, a sample is there from the first to the last view. A full turn about an axis off the middle is
@@ -74,7 +74,7 @@ class FieldEdges:
 
 
 def _median(values: F32) -> float:
-    """Of the rays that were measured; 0 where none was."""
+    """Median over the rays that were measured; 0 where none was."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else 0.0
 

@@ -49,7 +49,7 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
-    """The mean of gains [view held out] is more than so many of its standard errors, by their scatter."""
+    """Whether the mean gain [view held out] exceeds so many of its standard errors."""
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
     return float(gains.mean()) > errors * scatter
 
@@ -179,7 +179,7 @@ def choose_weight(
 
 
 class AllColumns(NamedTuple):
-    """The rows of a trial with all columns, air beside the sample, too: a fit of narrower views is a poorer one.
+    """The rows of a trial with all columns, including air: a fit of narrower views is poorer.
 
     Attributes:
         cols: those of the trial.
@@ -275,11 +275,11 @@ class HeldOutTrial:
 
     @property
     def ended(self) -> bool:
-        """The trials were ended; no volume is judged any more."""
+        """Whether the trials were ended; no volume is judged any more."""
         return self._ended
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
-        """`residuals` of the volume of this prior and strength; kept, so that each volume is made once."""
+        """Residuals for this prior and strength; each volume is made once."""
         if (prior, strength) not in self._known:
             x = volume(strength)
             residuals = self._known[prior, strength] = self.residuals(x)
@@ -288,11 +288,11 @@ class HeldOutTrial:
         return self._known[prior, strength]
 
     def remember(self, prior: str, preferred: BestStrength) -> None:
-        """Take the least residual of a search as that of the strength it prefers."""
+        """Record the least residual of a search for the strength that it prefers."""
         self._known[prior, preferred.strength] = preferred.residuals
 
     def of_weight(self, weight: float) -> F64:
-        """`residuals` of total variation with this weight; the best volume of all is kept as `smooth`."""
+        """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
         return self.residuals_of("weight", weight, self.with_weight)
 
     def with_weight(self, weight: float) -> F32:
@@ -302,7 +302,7 @@ class HeldOutTrial:
         ))  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
-        """The volume that `make` makes of the first one, which it may overwrite; that one where the trials ended."""
+        """The volume that `make` computes from a copy of the first one; that copy once the trials ended."""
         x = (self.start if start is None else start).copy()
         if self._ended:
             return x

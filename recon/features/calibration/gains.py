@@ -162,7 +162,7 @@ class _Band:
         return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
-        """[view] mean square that volume and gains leave of views held out, in some rows."""
+        """[view] mean square residual of views held out, by volume and gains, in some rows."""
         left = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
         known = None if self.known is None else np.broadcast_to(self.known, left.shape)[:, rows]
         return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))

@@ -32,7 +32,7 @@ _SURE = 2.0  # see `beyond_chance`
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Deviations of views held out.
+    """Measures how well a geometry predicts views held out.
 
     Attributes:
         views: float32 [view, row, col], line integrals.
@@ -47,7 +47,7 @@ class Judge:
     placed: bool
 
     def deviations(self, geometry: Geometry) -> F64:
-        """[view held out] root mean squares by a volume of the others in this geometry."""
+        """[view held out] root mean square residual, by a volume of the others in this geometry."""
         method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
         unseen, images = predicted_views(method, self.views, geometry, self.grid, self.known, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
@@ -90,7 +90,7 @@ _NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller change
 
 @dataclass(frozen=True, eq=False)
 class LearntGeometry:
-    """What was learnt of a geometry.
+    """The learnt change of a geometry, as far as it is confirmed.
 
     Attributes:
         change: in pixels of the views; what was not confirmed is zero.
@@ -105,7 +105,7 @@ class LearntGeometry:
     after: float
 
     def in_words(self, binning: int = 1) -> str:
-        """In a sentence, in pixels smaller by `binning`."""
+        """The result as a sentence, in pixels smaller by `binning`."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: the views show no error of it that matters; it is left as it was."
@@ -116,7 +116,7 @@ class LearntGeometry:
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
-        """For the file of a volume, by name; pixels smaller by `binning`."""
+        """Values for the file of a volume, by name, in pixels smaller by `binning`."""
         return {
             "calibrate_confirmed": ",".join(self.confirmed) or "none",
             "calibrate_axis_change_px": self.change.axis * binning,

@@ -44,7 +44,7 @@ def levels(cols: int) -> list[tuple[int, int]]:
 
 
 def motion_sweeps(cols: int) -> int:
-    """Of `learnt_motion`."""
+    """Number of sweeps of `learnt_motion`."""
     return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
 
 
@@ -102,7 +102,7 @@ def unseen_squares(
 
 
 def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
-    """[view] weighed squares of what densities [knot, z, y, x] leave."""
+    """[view] weighted squared residual by densities [knot, z, y, x]."""
     projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
     weight = None if views.weight is None else projection_lines(views.weight)
     squares = np.empty(len(data))
@@ -227,7 +227,7 @@ def register_energies(
 
 
 def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tuple[float, float]) -> EnergyViews:
-    """All views in the magnification of the reference; pixels that were not measured weigh nothing."""
+    """All views at the magnification of the reference; pixels that were not measured weigh nothing."""
     if all(move.magnification == 1 for move in moves):
         return views
     data, weight = views.projections.copy(), np.ones_like(views.projections)

@@ -207,7 +207,7 @@ class _History:
         self.began = self.control.now()
 
     def heard(self, sweep: int, residual: float) -> bool:
-        """As `fit_series` and `fit_materials` call their `go_on`."""
+        """The `go_on` of `fit_series` and `fit_materials`."""
         if sweep > 0:
             self.tell(sweep, residual)
         else:
@@ -217,12 +217,12 @@ class _History:
         return not self.control.stop()
 
     def heard_share(self, steps_to_come: int) -> bool:
-        """As `fit_share` calls its `go_on`."""
+        """The `go_on` of `fit_share`."""
         self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
-        """Of a sweep of the fit."""
+        """Record and report a sweep of the fit."""
         self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
 
     def _tell(self, reached: Progress) -> Progress:
@@ -233,7 +233,7 @@ class _History:
     def result(
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
     ) -> Reconstruction:
-        """The volumes with this history."""
+        """The reconstruction with this history."""
         if not self.of_sweeps:  # it was stopped before
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
@@ -249,7 +249,7 @@ def _require_own_grid(problem: ReconProblem) -> None:
 
 
 def _bytes_of(geometry: Geometry) -> int:
-    """Of all line integrals."""
+    """Bytes of all line integrals."""
     return 4 * geometry.n_views * math.prod(geometry.detector_shape)
 
 
@@ -270,7 +270,7 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
-    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
     judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"

@@ -95,7 +95,7 @@ class FieldMethod(Checked, ABC):
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """At most: `seconds` may end it."""
+        """The most work: `seconds` may end the fit earlier."""
         if self.seconds is not None:
             return Costs({self.name: Work.of(CLOCK, self.seconds)})
         samples = self.steps * self.rays * self.samples_of(max(grid.shape))
@@ -126,12 +126,12 @@ class _Views:
         return usable & (self.data[view] > 0) if foreground else usable
 
     def of(self, view: int, pixels: Places) -> tuple[F32, F32]:
-        """Values and weights of pixels."""
+        """Values and weights of some pixels of a view."""
         known = np.ones(pixels.size, np.float32) if self.weights is None else self.weights[view].reshape(-1)[pixels]
         return self.data[view].reshape(-1)[pixels], known
 
     def mean_density(self) -> float:
-        """In the box, from some rays of each view."""
+        """Mean density in the box, from some rays of each view."""
         pixels = np.arange(0, self.data[0].size, max(1, self.data[0].size // _SOME))
         lengths = sum(float(rays_of(self.geometry, v, pixels, self.grid).lengths.sum()) for v in range(len(self.data)))
         return float(self.data.reshape(len(self.data), -1)[:, pixels].sum()) / max(lengths, 1e-9)
