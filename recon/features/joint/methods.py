@@ -212,23 +212,21 @@ class _History:
             self.tell(sweep, residual)
         else:
             self.tried += 1
-            self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
+            self.control.tell_part(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
             self.tried = 0 if sweep == 0 else self.tried
         return not self.control.stop()
 
     def heard_share(self, steps_to_come: int) -> bool:
         """The `go_on` of `fit_share`."""
-        self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
+        self.control.tell_part(STEPS - steps_to_come, STEPS, self.began, self.n_views, "steps of the share")
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
         """Record and report a sweep of the fit."""
-        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
-
-    def _tell(self, reached: Progress) -> Progress:
-        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        self.control.tell(now)
-        return now
+        seconds = self.control.now() - self.began
+        reached = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
+        self.of_sweeps = (*self.of_sweeps, reached)
+        self.control.tell(reached)
 
     def result(
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
@@ -237,10 +235,6 @@ class _History:
         if not self.of_sweeps:  # it was stopped before
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
-
-
-def _progress(n: int, of: int, unit: str) -> Progress:
-    return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
 
 
 def _require_own_grid(problem: ReconProblem) -> None:
