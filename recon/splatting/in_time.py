@@ -16,7 +16,7 @@ from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, Run
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Rates, Work
 from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS, finish
-from recon.splatting.fit_method import FitMethod, StreamingMethod
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     SCALED_BY,
@@ -158,7 +158,7 @@ class LastRound:
     """
 
     fit: StreamingFit
-    method: StreamingMethod
+    method: FitMethod
     seconds: float
     began: float
     before: Sequence[Progress] = ()

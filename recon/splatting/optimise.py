@@ -270,10 +270,8 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
 
     settle(state)
     device = backend or Cpu()
-    means, log_scales, quaternions, raw = (
-        torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES
-    )  # fmt: skip
-    return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
+    tensors = (torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES)
+    return Gaussians(*tensors, density_unit=state.unit, kernel=state.kernel)
 
 
 def volume_of(state: FitState, grid: Grid, views: Geometry, settings: FitSettings) -> Volume:
@@ -331,12 +329,8 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     fresh = change.keep.size
     if origin.size == 0:
         return  # all Gaussians are faint, as in empty views: later views may need them
-    grown = {
-        "means": change.means,
-        "log_scales": change.log_scales,
-        "quaternions": p["quaternions"][origin],
-        "raw": change.raw,
-    }
+    parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
+    grown = dict(zip(NAMES, parts, strict=True))
     order = _order(grown)
     if state.mean is not None:
         for name, new in grown.items():
