@@ -270,8 +270,8 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
 
     settle(state)
     device = backend or Cpu()
-    tensors = (torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES)
-    return Gaussians(*tensors, density_unit=state.unit, kernel=state.kernel)
+    means, log_scales, quaternions, raw = (torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES)
+    return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
 
 
 def volume_of(state: FitState, grid: Grid, views: Geometry, settings: FitSettings) -> Volume:
