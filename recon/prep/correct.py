@@ -42,7 +42,7 @@ class CorrectionSettings:
             itself in the neighbouring views, to be replaced; inf replaces none.
         air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
         divided by their level, or by the line through the levels of both sides.
-        sample_from: line integral at the edges from which "auto" takes them for sample, see `air.edge_depth`.
+        sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
     """
 
     floor: float = 1e-4

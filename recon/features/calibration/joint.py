@@ -148,7 +148,7 @@ class JointFit:
     Attributes:
         data: [view, col, row], line integrals.
         known: [view, col, row] weights of rays; None: one for all.
-        terms: of `freedom.TERMS`, which may change.
+        terms: of `TERMS`, which may change.
         volume: the best so far.
         turned: the data as a detector without roll would have taken them.
     """

@@ -138,7 +138,7 @@ def learn_geometry(
 
     Args:
         projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
-        terms: what may change, of `freedom.TERMS`.
+        terms: what may change, of `joint.TERMS`.
         progress: steps done, and steps at most.
         known: [row, col] weights of pixels; None: one for all.
 

@@ -216,7 +216,7 @@ _FLOOR = 1e-6  # of the mean line integral
 
 @dataclass(frozen=True)
 class Mlem(Checked):
-    """See `likelihood.mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
+    """See `mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
 
     Line integrals that come without counts are taken for counts with their weights as survival.
 
