@@ -178,8 +178,8 @@ class Half:
     (
         (
             "simulators/effects/catalogue.py",
-            '        "photon_noise": EffectRow(Domain.PHOTONS, "photons arrive at random"),',
-            '        "half": EffectRow(Domain.PHOTONS, "half of the light"),',
+            '        "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),',
+            '        "half": EffectRow(Domain.PHOTONS, "half of the light", module="simulators.effects.half"),',
         ),
     ),
     """
