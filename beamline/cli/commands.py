@@ -63,14 +63,14 @@ def _core(module: str, help_line: str, libraries: Libraries = Libraries.NONE, *,
 
 CORE = {
     "check": _core("config", "Validate a configuration. Nothing moves.", files=False),
-    "home": _core("home", "Search the stage's reference position. The stage turns."),
+    "home": _core("control", "Search the stage's reference position. The stage turns."),
     "scan": _core("scan", "Run a scan, or print its plan with --dry-run.", Libraries.FRAMES),
     "pause": _core("control", "Pause a running scan, from another terminal: no view is lost."),
     "resume": _core("control", "Let a paused scan go on."),
     "stop": _core("control", "Stop a running scan cleanly, from another terminal."),
     "abort": _core("control", "Abort a running scan at once, from another terminal."),
     "recon": _core("recon", "Reconstruct a scan, finished or still running.", Libraries.FITS),
-    "recover": _core("recover", "Make an ordinary scan file of one whose writer died."),
+    "recover": _core("control", "Make an ordinary scan file of one whose writer died."),
     "monitor": _core(
         "monitor", "Look at the frames of a scan file with the checks of the monitor.", Libraries.FRAMES, files=False
     ),

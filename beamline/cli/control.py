@@ -1,12 +1,19 @@
-"""`beamline pause`, `resume`, `stop` and `abort`: verbs to a running scan from another terminal."""
+"""`beamline pause`, `resume`, `stop`, `abort`, `home` and `recover`: verbs to a run, the stage, or a broken scan."""
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from pathlib import Path
 
 import click
 
-from beamline.core.errors import ConfigError
+from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
+from beamline.core.errors import INTERRUPTED, ConfigError
+from beamline.core.events import Done
+from beamline.core.stop import terminated_like_interrupted
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError
 
 _EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
 
@@ -61,3 +68,75 @@ def _only(runs: Path) -> Path:
     if len(running_scans) == 1:
         return running_scans[0]
     raise ConfigError(f"{_running_in(runs)}. Name the folder of the run. Nothing was changed.")
+
+
+@click.command()
+@config_argument
+@click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
+@click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Longest time of the search, s.")
+@set_option
+def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
+    """Search the reference position of the stage in CONFIG.
+
+    THE STAGE TURNS, possibly by a full turn and beyond its soft limits. No other device is connected. Ctrl-C stops
+    the stage.
+
+    Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
+    """
+    from beamline.config.load import load
+    from beamline.instrument.connect import stage_alone
+
+    config = load(file, overrides)
+    stage_config = config.devices.stage
+    if not yes:
+        way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference. May it turn?"
+        try:
+            free = click.confirm(way, err=True)
+        except click.Abort:  # Ctrl-C, or the end of input: there is no operator
+            click.echo(err=True)
+            free = False
+        if not free:
+            click.echo(
+                "beamline: The search was not confirmed. Nothing has moved. Use --yes to search without a question.",
+                err=True,
+            )
+            click.get_current_context().exit(INTERRUPTED)
+    with terminated_like_interrupted(), stage_alone(config) as stage:
+        try:
+            stage.start_home()
+            angle = stage.wait(timeout)
+        except BaseException:
+            # Also after a search that failed: the state of the controller is not known. The first error is reported.
+            with suppress(DeviceError):
+                stage.stop()
+            raise
+        click.echo(f"The stage has found its reference and is at {math.degrees(angle):.4f} deg.")
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@json_option
+def recover(file: Path, as_json: bool) -> None:
+    """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
+
+    Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. It can be
+    run again after whatever stopped it, needs no room for a copy, and says what room it needs.
+    """
+    from beamline.core.files import SCAN
+    from beamline.scan.resume import recover_run
+    from beamline.storage.parts import JOINED
+    from beamline.storage.recover import recover as recover_scan
+
+    def say(what: str) -> None:
+        click.echo(what, err=True)
+
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
+        recovered, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
+        for sentence in left_out:
+            click.echo(f"Warning: {sentence}", err=True)
+        for done in recovered:
+            sink(Done(done, time=SystemClock().now()))
+    if not as_json:
+        click.echo("\n".join(done.in_words() for done in recovered))

@@ -9,7 +9,6 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
     POSITIVE,
     NameChoice,
@@ -21,6 +20,7 @@ from beamline.cli.options import (
     run_option,
     together,
 )
+from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
 from recon.assess.plans import MODEL_STEPS, PRESETS
 from recon.assess.time_model import parse_budget

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
-from beamline.cli.page_beside import PageBeside
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
 from beamline.core.files import remove

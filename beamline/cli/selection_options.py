@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE, NameChoice, WholeRange, option, parsed, together
+from beamline.cli.recipe import CORRECTIONS, DATA, heading
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
 from beamline.projections.step import Option, options_of

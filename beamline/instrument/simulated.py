@@ -131,7 +131,7 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     Raises:
         ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
     """
-    from beamline.simulate.volumes import volumes_beside
+    from beamline.simulate.labels import volumes_beside
     from simulators.frame.mapping import SceneError
     from simulators.scenes.scene import load_scene
 

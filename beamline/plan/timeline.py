@@ -12,10 +12,19 @@ from numpy.typing import NDArray
 
 from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
-from beamline.plan.angles import Retake, retake_block, return_block, spread_retakes
-from beamline.plan.limits import PlanFacts, remarks, violations
-from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.triggers import Flight, Scale, plan_flight
+from beamline.plan.limits import Flight, PlanFacts, Scale, plan_flight, remarks, violations
+from beamline.plan.plan import (
+    Block,
+    FieldPlan,
+    Mode,
+    Place,
+    Retake,
+    ScanPlan,
+    Timeline,
+    retake_block,
+    return_block,
+    spread_retakes,
+)
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
 

@@ -16,9 +16,8 @@ from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
-from beamline.projections.filters import ViewFilters
 from beamline.projections.open_beam import OpenBeam, count_references
-from beamline.projections.read import read_binned, reading_memory, tell_damaged
+from beamline.projections.read import ViewFilters, read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence

@@ -15,7 +15,7 @@ from beamline.core.phases import Phases
 from beamline.core.plausible import RANGES, doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
+from beamline.projections.consistency import compare_with_flats, cut_sentence, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.references import uncorrected_current
@@ -26,7 +26,6 @@ from beamline.projections.refusals import checked_views
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
-from beamline.projections.truncation import cut_sentence, cut_sides
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import ViewGeometry
 from beamline.storage.readers.averaged import JOINED_DEG
@@ -39,6 +38,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
 _SAME_AXIS = 0.05  # columns
@@ -286,7 +286,7 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    if sides := cut_sides(projections.data, geometry):
+    if sides := FieldEdges.of(projections.data, geometry).beyond():
         warn(cut_sentence(sides))
         if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
             warn(change)

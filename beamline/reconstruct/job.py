@@ -19,13 +19,12 @@ from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
-from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by
+from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import run_on
+from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
-from beamline.reconstruct.workers import cluster
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry

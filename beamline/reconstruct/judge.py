@@ -10,8 +10,8 @@ from beamline.core.sinks import Note, event_of_sentence
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext
-from beamline.reconstruct.remarks import (
+from beamline.reconstruct.outcome import (
+    ReportContext,
     hiding_warning,
     lost_mass_warning,
     needles_warning,

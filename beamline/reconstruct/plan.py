@@ -21,10 +21,10 @@ from beamline.core.text import size
 from beamline.projections.prepare import DiskBuffer, prepare_projections, refuse_spilled
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, cone_of
-from beamline.reconstruct.error_bars import refuse_impossible, refuse_views
 from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.memory import (
     ReconMemory,
+    cluster,
     memory_of,
     recon_memory_of,
     refuse_few_views,
@@ -42,7 +42,7 @@ from beamline.reconstruct.options import (
     with_as_many_views,
 )
 from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.workers import cluster
+from beamline.reconstruct.run import refuse_impossible, refuse_views
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array

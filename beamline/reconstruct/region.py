@@ -15,12 +15,12 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
-from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.voxels.field_edges import FieldEdges
 
 Span = tuple[int, int]
 
@@ -196,7 +196,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     grid = Grid.matching(geometry_of(source, selection, prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
-    if cut := cut_sides(data, geometry):
+    if cut := FieldEdges.of(data, geometry).beyond():
         where = " and the ".join(cut)
         return _whole(height, across, f"the sample goes on beyond the field at the {where}, where it shows no edge")
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))

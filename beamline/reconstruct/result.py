@@ -20,8 +20,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext, label_of
-from beamline.reconstruct.remarks import partly_seen
+from beamline.reconstruct.outcome import ReportContext, label_of, partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT

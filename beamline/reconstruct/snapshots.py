@@ -19,7 +19,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
-from beamline.plan.angles import one_way
+from beamline.plan.plan import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions

@@ -33,8 +33,8 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
-from beamline.plan.angles import Retake, spread_retakes
-from beamline.projections.returned import ReturnedView, returned_views
+from beamline.plan.plan import Retake, spread_retakes
+from beamline.projections.flagged_frames import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
