@@ -102,7 +102,6 @@ def prepare_projections(
         views = import_module(in_folders("beamline.features", "VIEWS")["emission"])
         emitted: PreparedProjections = views.prepare_emission(source, emission, selection, warn)
         return emitted
-    _warn_of_joined_views(source, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
     usable, poses = _usable(source, selection, warn)
@@ -166,6 +165,7 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
     """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
+    _warn_of_joined_views(source, warn)
     usable = checked_views(source, selection, warn)
     _warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
@@ -301,8 +301,7 @@ def assemble(
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
     unknown = areas(unknown)
-    regions = replace(usable.regions, resampling=resampling)
-    binning = selection.binning
+    regions, binning = replace(usable.regions, resampling=resampling), selection.binning
 
     def shares_of(views: slice, part: slice) -> NDArray[np.float32] | None:
         within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)

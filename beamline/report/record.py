@@ -119,8 +119,6 @@ def quality_against_time(
         psnr: (seconds, dB) of each snapshot; none without a truth.
         further: time that another dB would take; None if it is not known.
     """
-    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
-
     seconds = history["seconds"]
     growing = [
         (name, label)
@@ -132,25 +130,7 @@ def quality_against_time(
     down, across = (1, panels) if panels < 4 else (2, 2)
     figure = new_figure((WIDTH, 3.1 * down))
     left, *others = np.ravel(figure.subplots(down, across))
-    for name, label, colour in (
-        ("loss", "loss", "tab:blue"),
-        ("residual", "residual", "tab:orange"),
-        ("held_out", "residual, held out", "tab:red"),
-    ):
-        if name == "loss" and np.array_equal(history[name], history.get("residual", [])):
-            continue  # the loss of iterations is the residual itself
-        if name in history and np.any(np.isfinite(history[name])):
-            left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
-    if values.min(initial=np.inf) > 0 and values.max() > 10 * values.min():
-        left.set_yscale("log")
-        left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-        left.yaxis.set_major_formatter(ScalarFormatter())
-        left.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        left.set_ylim(bottom=0)
-    left.set(xlabel="time (s)", title="Misfit")
-    left.legend(fontsize=8)
+    _misfit(left, history)
     if curve is not None:
         _decibels(others.pop(0), *record(curve.seconds, curve.residuals), curve.views, further)
     if psnr:
@@ -168,6 +148,31 @@ def quality_against_time(
         panel.grid(alpha=0.3)
         panel.tick_params(labelsize=8)
     return png(figure)
+
+
+def _misfit(axes: Axes, history: Mapping[str, NDArray[np.floating]]) -> None:
+    """Loss and residuals, on a logarithmic axis where they fall to less than a tenth."""
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    for name, label, colour in (
+        ("loss", "loss", "tab:blue"),
+        ("residual", "residual", "tab:orange"),
+        ("held_out", "residual, held out", "tab:red"),
+    ):
+        if name == "loss" and np.array_equal(history[name], history.get("residual", [])):
+            continue  # the loss of iterations is the residual itself
+        if name in history and np.any(np.isfinite(history[name])):
+            axes.plot(history["seconds"], history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()])
+    if values.min(initial=np.inf) > 0 and values.max() > 10 * values.min():
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        axes.yaxis.set_major_formatter(ScalarFormatter())
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes.set_ylim(bottom=0)
+    axes.set(xlabel="time (s)", title="Misfit")
+    axes.legend(fontsize=8)
 
 
 def _decibels(
