@@ -53,12 +53,10 @@ class DiskBuffer:
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
         batch: views that are corrected at a time.
-        progress: how many of how many frames were read.
     """
 
     views: NDArray[np.float32]
     batch: int
-    progress: Callable[[int, int], None]
 
 
 def _warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
@@ -212,7 +210,7 @@ def _corrected(
     if buffer is None:
         projections = correction.at_once(used, progress=phases.progress)
     else:
-        projections = correction.in_batches(used, buffer.views, buffer.batch, buffer.progress)
+        projections = correction.in_batches(used, buffer.views, buffer.batch, phases.progress)
     if 2 * projections.view_ids.size < used.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
