@@ -149,7 +149,8 @@ def distances(value: str) -> tuple[float, float]:
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of `Selection`, from --views on, with those of every step, and what `scan_options` adds."""
-    return together(*_BEFORE, scan_options, *_AFTER, *map(_of_step, _step_options()))(command)
+    of_steps = (_of_step(option) for step in registered() for option in options_of(step).values())
+    return together(*_BEFORE, scan_options, *_AFTER, *of_steps)(command)
 
 
 def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
@@ -178,11 +179,6 @@ def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
         return steps_of(values)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
-
-
-def _step_options() -> list[Option]:
-    """The options of all steps, in the order of the registry."""
-    return [option for step in registered() for option in options_of(step).values()]
 
 
 def _of_step(asked: Option) -> Callable[..., Any]:

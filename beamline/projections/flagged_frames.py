@@ -18,7 +18,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import groups_of
 from drivers.base.frame import FrameKind
 from recon.base.binning import bin_views
-from recon.prep.shift import UNKNOWN, ViewShift, shift_between
+from recon.prep.shift import shift_between
 
 if TYPE_CHECKING:
     from beamline.report.sheets import FlaggedFrame
@@ -207,13 +207,8 @@ def returned_views(source: ScanSource) -> list[ReturnedView]:
         if apart.min() * source.shape[1] / 2 > _BESIDE:
             continue
         first = int(views[apart.argmin()])
-        shift = _unbinned(shift_between(line_integrals(first), line_integrals(row)), binning)
-        sigma = float(np.fmax(shift.across_sigma, shift.down_sigma))
-        returned.append(ReturnedView(row, first, float(angles[row]), shift.across, shift.down, sigma, pixel))
+        shift = shift_between(line_integrals(first), line_integrals(row))
+        unbinned = (binning * shift.across, binning * shift.down)
+        sigma = binning * float(np.fmax(shift.across_sigma, shift.down_sigma))
+        returned.append(ReturnedView(row, first, float(angles[row]), *unbinned, sigma, pixel))
     return returned
-
-
-def _unbinned(shift: ViewShift, binning: int) -> ViewShift:
-    if shift is UNKNOWN or binning == 1:
-        return shift
-    return ViewShift(*(binning * value for value in (shift.across, shift.down, shift.across_sigma, shift.down_sigma)))

@@ -62,7 +62,8 @@ def judge(
     judged.compare_regions()
     judged.compare_air()
     judged.decide_whether_fbp_is_kept(in_parts)
-    judged.tell_what_was_left_out()
+    if judged.left_out_text:
+        sink(StateEntered("left_out", judged.left_out_text, time=clock.now()))
     return judged
 
 
@@ -118,11 +119,6 @@ class VolumeLooks:
         if sentence:
             self.sink(event_of_sentence(sentence, self.clock.now()))
             self.warnings.append(sentence)
-
-    @property
-    def stray_map(self) -> NDArray[np.float32] | None:
-        """The map of mass where views show nothing [y, x]; None without any."""
-        return self.stray.map if self.stray is not None and self.stray.share > 0 else None
 
     @property
     def left_out_text(self) -> str:
@@ -242,10 +238,6 @@ class VolumeLooks:
             "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
             "disk. Make it with --method fbp to compare."
         )
-
-    def tell_what_was_left_out(self) -> None:
-        if self.left_out_text:
-            self.sink(StateEntered("left_out", self.left_out_text, time=self.clock.now()))
 
 
 def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_] | None:

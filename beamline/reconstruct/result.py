@@ -78,7 +78,8 @@ def write_result(
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
-    context = replace(context, warnings=remarks, stray=judged.stray_map)
+    stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
+    context = replace(context, warnings=remarks, stray=stray)
     phases.enter("report")
     record, volumes = _record(judged, context, clock.now())
     page, timed = None, _nothing
