@@ -62,7 +62,7 @@ def _core(module: str, help_line: str, libraries: Libraries = Libraries.NONE, *,
 
 
 CORE = {
-    "check": _core("config", "Validate a configuration. Nothing moves.", files=False),
+    "check": _core("control", "Validate a configuration. Nothing moves.", files=False),
     "home": _core("control", "Search the stage's reference position. The stage turns."),
     "scan": _core("scan", "Run a scan, or print its plan with --dry-run.", Libraries.FRAMES),
     "pause": _core("control", "Pause a running scan, from another terminal: no view is lost."),
@@ -74,7 +74,7 @@ CORE = {
     "monitor": _core(
         "monitor", "Look at the frames of a scan file with the checks of the monitor.", Libraries.FRAMES, files=False
     ),
-    "config": _core("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
+    "config": _core("control", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 """What acquires, watches and reconstructs, in the order of the help."""
 

@@ -14,8 +14,8 @@ from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
+from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats

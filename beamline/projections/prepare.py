@@ -22,12 +22,11 @@ from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanStep
-from beamline.projections.refusals import checked_views
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.view_geometry import ViewGeometry
+from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind

@@ -19,7 +19,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
-from beamline.projections.view_geometry import with_rays
+from beamline.projections.views import with_rays
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind

@@ -17,7 +17,7 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.step import StepMemory
-from beamline.projections.view_geometry import stated_geometry
+from beamline.projections.views import stated_geometry
 from beamline.reconstruct.options import ReconOptions, views_of_others, with_as_many_views
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry

@@ -20,7 +20,7 @@ from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.view_geometry import stated_geometry
+from beamline.projections.views import stated_geometry
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
