@@ -135,14 +135,14 @@ def selection_of(
     views: str | None,
     binning: int | None,
 ) -> Selection:
-    """The selection with what is said beside it."""
+    """The selection with rows, views and binning of the arguments."""
     stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
     return replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
 
 
 @contextmanager
 def target_of(output: str | Path | None) -> Iterator[OutputPaths]:
-    """Where a result goes, with its report; without an output nothing is written."""
+    """Paths of the result and its report; without an output nothing is written."""
     if output is not None:
         yield OutputPaths(Path(output), report_beside(Path(output)))
         return

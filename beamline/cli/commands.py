@@ -16,7 +16,7 @@ from recon.base.registry import Registry, in_folders
 
 
 class Libraries(Enum):
-    """What the libraries of some commands need, under a limit of addresses.
+    """Address space that the libraries of a command need, and modules to load before its data.
 
     Attributes:
         addresses: bytes that a command on a tiny scan takes at its peak, with one thread of BLAS, and a twentieth more;
@@ -35,7 +35,7 @@ class Libraries(Enum):
 
 @dataclass(frozen=True)
 class CommandEntry:
-    """Where a command is, and its help line.
+    """A command: the module that defines it, and its line in the help.
 
     Attributes:
         module: in which the command has its own name, "-" as "_".
@@ -92,7 +92,7 @@ def own_commands() -> dict[str, CommandEntry]:
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands, with those of other packages, which are asked only where a name is not ours."""
+    """All commands. Other packages are searched only for names that are not ours."""
     return Registry("command", own_commands(), _entry_of)
 
 

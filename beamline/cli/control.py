@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
 from beamline.core.errors import INTERRUPTED, ConfigError
-from beamline.core.events import Done
+from beamline.core.events import Done, Sink
 from beamline.core.stop import terminated_like_interrupted
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
+
+if TYPE_CHECKING:
+    from beamline.storage.recover import Recovered
 
 _EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
 
@@ -135,12 +140,17 @@ def recover(file: Path, as_json: bool) -> None:
     with terminated_like_interrupted(), json_events(as_json) as sink:
         run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
         recovered, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
-        for sentence in left_out:
-            click.echo(f"Warning: {sentence}", err=True)
-        for done in recovered:
-            sink(Done(done, time=SystemClock().now()))
-    if not as_json:
-        click.echo("\n".join(done.in_words() for done in recovered))
+        recovered_files(recovered, left_out, sink, as_json)
+
+
+def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
+    """Tell of each file of a run that was recovered, and of the parts that were left out."""
+    for sentence in left_out:
+        click.echo(f"Warning: {sentence}", err=True)
+    for done in recovered:
+        sink(Done(done, time=SystemClock().now()))
+        if not as_json:
+            click.echo(done.in_words())
 
 
 @click.group()

@@ -167,7 +167,7 @@ def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) ->
 
 
 def table(kinds: Iterable[Kind]) -> list[str]:
-    """The flags for people, three lines a check and level."""
+    """Flags as text: three lines for each check and level."""
     from beamline.monitor.checks import CHECKS
 
     units, lines = {check.name: check.unit for check in CHECKS}, []

@@ -25,7 +25,7 @@ _SHOWN = 40  # most characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
-    """All that determines a step or a slab: data (by a checksum), geometry and settings.
+    """Origin of a fit or a slab: checksum of the data, geometry and settings.
 
     Args:
         prepared: line integrals and geometry; views held out do not matter.

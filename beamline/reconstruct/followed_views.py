@@ -31,7 +31,7 @@ from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
 
 class FollowState(Enum):
-    """What the fit of a growing scan waits for, or does."""
+    """State of the fit of a growing scan."""
 
     WAITS_FOR_REFERENCES = auto()
     WAITS_FOR_AXIS = auto()
@@ -41,7 +41,7 @@ class FollowState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Cursor:
-    """How far the fit has come in the file.
+    """Progress of the fit in a growing file.
 
     Attributes:
         frames: in the file at the last look.
@@ -114,7 +114,7 @@ _FIRST_VIEWS = 12  # fewer views do not determine an axis
 
 
 class AxisSearch:
-    """Looks for the axis each time the views have grown by half, and once more when all are there.
+    """Searches the rotation axis each time the views have grown by half, and once more at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.
@@ -185,7 +185,7 @@ def planned_views(
 
 
 class EnoughViews:
-    """Looks at the views each time they have grown by a quarter.
+    """Predicts the gain of further views each time the views have grown by a quarter.
 
     A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
     which errs on the side of more views.

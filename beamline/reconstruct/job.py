@@ -177,7 +177,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
 def runner_of(
     options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
 ) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
-    """`run_on` with the seed and the device of the options; what a method refuses names the file."""
+    """`run_on` with seed and device of the options; errors of the method name the scan file."""
 
     def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
         with refused(options, f" by {method.name}"):
@@ -187,7 +187,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct by the options: within a budget, in slabs, or at once. Then the views as the volume used them."""
+    """Reconstruct within a budget, in slabs, or at once; returns the volume, and the views as it used them."""
     prepared = job.prepared
     if job.options.budget is not None:
         return _within_budget(job, job.options.budget)

@@ -68,7 +68,7 @@ def judge(
 
 
 class VolumeLooks:
-    """The looks at one volume, in their order, and what they showed; arguments as of `judge`.
+    """Checks of one volume, in their order, and their results; arguments as of `judge`.
 
     Attributes:
         volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
@@ -103,7 +103,7 @@ class VolumeLooks:
 
     @property
     def waited_for(self) -> bool:
-        """Somebody stopped the reconstruction, and waits."""
+        """Whether the reconstruction was stopped, so that the user waits for its end."""
         return self.made.ending.early
 
     @property
@@ -111,18 +111,18 @@ class VolumeLooks:
         return by_name(self.made.method).traits.direct
 
     def has_time_for(self, projections: float) -> bool:
-        """Whether there is time for so many times the projection of all views."""
+        """Whether there is time for `projections` projections of all views."""
         return not self.waited_for and self.context.leaves(projections * self.all_rays)
 
     def warn(self, sentence: str) -> None:
-        """Tell of a warning that is not empty, and keep it."""
+        """Send and keep a warning; an empty one is ignored."""
         if sentence:
             self.sink(event_of_sentence(sentence, self.clock.now()))
             self.warnings.append(sentence)
 
     @property
     def left_out_text(self) -> str:
-        """The looks left out, and why; empty without any."""
+        """A sentence on the checks left out, and why; empty without any."""
         if not self.left_out:
             return ""
         why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"

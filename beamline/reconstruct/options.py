@@ -52,7 +52,7 @@ class SeveralScans(Protocol):
 
     @property
     def path(self) -> Path | str:
-        """Of the first scan."""
+        """Path of the first scan."""
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The first scan."""

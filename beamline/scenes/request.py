@@ -124,7 +124,7 @@ class SimulateRequest:
 
 
 class Output:
-    """Prints results as lines, and sends them as events to programs."""
+    """Prints results as lines for people and sends them as events to programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
         self._sink, self._clock, self._plain = sink, clock, plain
