@@ -98,7 +98,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     if FieldEdges.of(data, geometry).beyond() or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
-        return _told(laws, warn)
+        return _reported(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     noise = _mass_noise(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
@@ -109,10 +109,10 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         laws += [_angles(shown, geometry.angles)] if near else []
         laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
         laws += [_axis(shown, geometry.axis_col, selection)]
-    return _told(laws, warn)
+    return _reported(laws, warn)
 
 
-def _told(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
+def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
     for law in laws:
         if law.broken:
             warn(law.sentence)

@@ -105,7 +105,8 @@ def write_result(
     phases.end()
     elapsed = clock.now() - context.started
     timed(elapsed)
-    record = _light(replace(record, elapsed=elapsed, times=phases.seconds), target)  # to replace it reads its voxels
+    record = replace(record, elapsed=elapsed, times=phases.seconds)  # reads the voxels, so that it comes first
+    record = _with_voxels_in_files(record, target)
     sink(VolumeDone(record, time=clock.now()))
     return record
 
@@ -181,7 +182,7 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
         )
 
 
-def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
+def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconRecord:
     """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:
