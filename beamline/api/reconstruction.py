@@ -18,7 +18,7 @@ from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
 from beamline.core.files import SCAN, parts_of
-from beamline.core.narration import sentence
+from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.energies.scans import EnergyScans, read_spectra
 from beamline.monitor.checks import CHECKS

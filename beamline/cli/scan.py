@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from beamline.core.run_result import RunResult
     from beamline.scan.energies import SeriesRun
     from beamline.scan.resume import ResumableRun
-    from drivers.manual import Ask
+    from drivers.in_beam import Ask
 
 TABLE = ".csv"  # suffix of a table of scans
 
@@ -217,7 +217,7 @@ def _queue() -> Any:
 @contextmanager
 def _shown(request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> Iterator[tuple[list[Sink], Ask]]:
     """The terminal and the page beside a scan, as sinks before the `others`; and what asks the operator."""
-    from beamline.instrument.operator import ask_operator
+    from beamline.instrument.connect import ask_operator
 
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
         sinks: list[Sink] = [terminal, *others, *([beside] if request.page else [])]

@@ -16,7 +16,7 @@ from beamline.storage.volumes.files import whole_volume
 from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
-    from simulators.effects.anomaly import Label
+    from simulators.effects.chain import Label
     from simulators.samples.sample import ReadVolume
 
 
