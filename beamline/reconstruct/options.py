@@ -20,7 +20,7 @@ from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.view_geometry import stated_geometry
+from beamline.projections.views import stated_geometry
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
@@ -52,7 +52,7 @@ class SeveralScans(Protocol):
 
     @property
     def path(self) -> Path | str:
-        """Of the first scan."""
+        """Path of the first scan."""
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The first scan."""

@@ -161,7 +161,7 @@ def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.
         signal.raise_signal(signal.SIGTERM)
 
     before = sorted(path.name for path in folder.iterdir())
-    monkeypatch.setattr("beamline.scenes.truth.write_truth", asked)
+    monkeypatch.setattr("beamline.scenes.scene_file.write_truth", asked)
     result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
     assert result.exit_code == 130
     assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]

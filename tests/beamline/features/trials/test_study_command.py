@@ -18,7 +18,7 @@ from beamline.features.trials import runner
 from beamline.features.trials.launch import DATA, TrialData, averaged
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import measured
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from recon.base.volume import Grid
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
