@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -71,8 +71,8 @@ def _is_of_a_feature(path: Path) -> bool:
     return not _FEATURES.isdisjoint(path.parents)
 
 
-# Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of one
-# process writes them. Only their order matters, so that they need not be those of this machine.
+# Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of
+# one process writes them. Only their order matters, so that they need not be those of this machine.
 _DURATIONS = Path(__file__).parent / "durations.json"
 
 
@@ -88,7 +88,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
 
 
-_SECONDS: Counter[str] = Counter()
+_SECONDS: defaultdict[str, float] = defaultdict(float)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -102,8 +102,10 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 def pytest_sessionfinish() -> None:
     if record := os.environ.get("SPLATLINE_DURATIONS"):
-        longest = {name: round(seconds, 1) for name, seconds in _SECONDS.most_common() if seconds >= 1}
-        Path(record).write_text(json.dumps(longest, indent=0) + "\n", encoding="utf-8")
+        longest = sorted(((s, name) for name, s in _SECONDS.items() if s >= 1), reverse=True)
+        Path(record).write_text(
+            json.dumps({name: round(s, 1) for s, name in longest}, indent=0) + "\n", encoding="utf-8"
+        )
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -18,8 +18,8 @@ COMMANDS = {name: command for name in commands() if (command := main.get_command
 TAKES_FILE = {
     "archive": "FILE -o out.h5", "batch": "FILE -o out", "export": "FILE -o out.nrrd", "ingest": "FILE out.h5",
     "materials": "FILE FILE --spectra FILE -o out.h5", "render": "FILE -o out.h5", "study": "fixed-views FILE",
-    "simulate": "FILE -o out.h5", "surface": "FILE -o out.stl", "sweep": "FILE axis=1:3:1", "voxelise": "FILE -o out.h5",
-    "xafs": "FILE --from 8.30 --to 8.42",
+    "simulate": "FILE -o out.h5", "surface": "FILE -o out.stl", "sweep": "FILE axis=1:3:1",
+    "voxelise": "FILE -o out.h5", "xafs": "FILE --from 8.30 --to 8.42",
 }  # fmt: skip
 """Commands that need more than the name of a file."""
 NO_FILE = {"completion", "config", "demo", "ioc", "tango", "pause", "resume", "stop", "abort", "runs"}
@@ -35,12 +35,9 @@ def says_json(name: str) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [(name, kind) for name in sorted(COMMANDS) if name not in NO_FILE for kind in KINDS if (name, kind) not in OTHERWISE],
+    ("name", "kind"), sorted({(name, kind) for name in COMMANDS.keys() - NO_FILE for kind in KINDS} - OTHERWISE)
 )
-def test_a_wrong_file_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, kind: str
-) -> None:
+def test_a_wrong_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, kind: str) -> None:
     monkeypatch.chdir(tmp_path)
     file, content = KINDS[kind]
     if content is not None:
