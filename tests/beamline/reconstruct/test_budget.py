@@ -314,6 +314,7 @@ def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) 
     assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
 
 
+@pytest.mark.slow
 def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
@@ -338,6 +339,7 @@ def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert done["chosen"] in page and done["next_db_said"] in page
 
 
+@pytest.mark.slow
 def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     options = ReconOptions(
