@@ -207,7 +207,9 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+        raise ConfigError(
+            f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
+        ) from None
     return read(text, str(path)).data
 
 

@@ -138,7 +138,13 @@ def test_the_protocol_is_met_by_every_method() -> None:
 class TestConformance(MethodConformance):
     """Ours pass the suite that is shipped."""
 
-    @pytest.fixture(params=[*methods.names(), "auto"])
+    @pytest.fixture(
+        params=[
+            pytest.param(name, marks=[pytest.mark.slow] * entry.module.startswith("recon.features"))
+            for name, entry in methods.METHODS.items()
+        ]
+        + ["auto"]
+    )
     def method(self, request: pytest.FixtureRequest) -> Method:
         fit = recon.R2(steps=40, gaussians=200, finish=2)
         if request.param == "auto":
