@@ -18,7 +18,7 @@ from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
-from beamline.plan.angles import from_text
+from beamline.plan.plan import from_text
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import ScanSource

@@ -14,6 +14,7 @@ from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.blobs import BLOCK, COLS, ROWS, Blobs
 from tests.beamline.monitor.conftest import COLS as FAKE_COLS
 from tests.beamline.monitor.conftest import ROWS as FAKE_ROWS
+from tests.slow_cases import others_slow
 
 
 def of_field(scan: Blobs) -> list[Flag]:
@@ -161,7 +162,7 @@ def test_a_beam_that_loses_three_percent_is_not_mass(fake: Any) -> None:
     assert fake.of("mass", frames) == []
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.03, 0.09, 0.3])
+@pytest.mark.parametrize("lost", others_slow([0.09, 0.3, 0.0, 0.03], 2))
 def test_thin_matter_that_passes_the_edges_is_no_mass_that_left_while_the_beam_weakens(fake: Any, lost: float) -> None:
     beside = (*SAMPLE, (0.0, 41.0, 5.0, 0.006), (0.0, -41.0, 5.0, 0.006))  # in both edges at 90°
     frames = fake.references()
