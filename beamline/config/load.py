@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from beamline.config.devices import DcamOrca
-from beamline.config.errors import declared_at, explain
 from beamline.config.models import Config as Config
 from beamline.config.models import (
     Fields,
@@ -27,7 +26,7 @@ from beamline.config.models import (
     SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
-from beamline.config.tree import Tree, override, read
+from beamline.config.tree import Tree, declared_at, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.shipped import config_folder as config_folder
@@ -207,7 +206,9 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+        raise ConfigError(
+            f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
+        ) from None
     return read(text, str(path)).data
 
 

@@ -62,7 +62,8 @@ def read_spectra(path: Path) -> Spectra:
     try:
         lines = [line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip()]
     except (OSError, csv.Error) as error:
-        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+        said = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{path} is no table of spectra ({said}). Expected {_TABLE}.") from error
     head, *rest = lines or [[]]
     names = tuple(name.strip() for name in head[1:])
     if not rest or not names or head[0].strip() != "energy_kev":

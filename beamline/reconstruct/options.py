@@ -35,7 +35,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import EarlyStopMethod, Method, PresetMethod
 from recon.base.volume import Grid
 from recon.methods import has_setting, names, streams
-from recon.splatting.fit_method import StreamingMethod
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
@@ -307,13 +307,13 @@ class ReconOptions:
         return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
 
     @property
-    def streaming(self) -> StreamingMethod:
+    def streaming(self) -> FitMethod:
         """The method for a followed scan.
 
         Raises:
             ConfigError: it needs the whole scan.
         """
-        if not isinstance(self.method, StreamingMethod):
+        if not isinstance(self.method, FitMethod):
             raise ConfigError(
                 f"--follow needs a method whose volume grows with the views ({', '.join(filter(streams, names()))}); "
                 f"run {self.method.name} without --follow when the scan has ended."

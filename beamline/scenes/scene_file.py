@@ -86,7 +86,7 @@ def _scene_text(name: str, overrides: Sequence[str]) -> tuple[Path, Mapping[str,
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read ({error}). Nothing was simulated.") from error
+        raise ConfigError(f"{path} cannot be read ({error.strerror or error}). Nothing was simulated.") from error
     tree = override(read(text, str(path)), overrides, environment={})
     return path, tree.data, yaml.safe_dump(tree.data, sort_keys=False) if overrides else text
 

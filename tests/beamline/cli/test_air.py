@@ -94,6 +94,7 @@ def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path])
     assert parts.done["background"].sentence == whole.done["background"].sentence
 
 
+@pytest.mark.slow
 def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:
     said, record = _recon(scans["bent"], tmp_path / "v.h5", "--follow", "--seconds", "1", "--no-report")
     assert "taken off" in record and record in said
