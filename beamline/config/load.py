@@ -31,7 +31,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.shipped import config_folder as config_folder
 from beamline.core.shipped import version
-from beamline.plan import angles
+from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
@@ -206,25 +206,27 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+        raise ConfigError(
+            f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
+        ) from None
     return read(text, str(path)).data
 
 
 def _angles(plan: Any) -> NDArray[np.float64]:
     match plan:
         case SectorAngles():
-            return angles.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
+            return plans.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
         case FileAngles():
-            return angles.from_text(text_in(Path(plan.path)))
+            return plans.from_text(text_in(Path(plan.path)))
     start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
     match plan:
         case RandomAngles():
-            return angles.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
+            return plans.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
         case InterlacedAngles():
-            return angles.interlaced(plan.views, plan.passes, start, span)
+            return plans.interlaced(plan.views, plan.passes, start, span)
         case GoldenAngles():
-            return angles.golden(plan.views, start, span)
-    return angles.fixed(plan.views, start, span)
+            return plans.golden(plan.views, start, span)
+    return plans.fixed(plan.views, start, span)
 
 
 def _field(fields: Fields, exposure: float) -> FieldPlan:

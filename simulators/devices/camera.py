@@ -20,7 +20,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.devices.camera_view import CameraView, Exposed
 from simulators.devices.trigger_line import TriggerLine
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError
