@@ -14,7 +14,7 @@ from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.sample import Sample
 
 LARGEST = 256  # Voxels across by default: 256³ take 84 MB with the labels

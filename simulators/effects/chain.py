@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator
 
 from simulators.effects.catalogue import CATALOGUE, FINAL, Domain, class_of, order_error
-from simulators.frame.pose import Pose
-from simulators.frame.shot import Image, Moments, Shot
+from simulators.frame.shot import Image, Moments, Pose, Shot
 
 StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
 """A context that is entered with the name of each step of an exposure, to measure its cost."""

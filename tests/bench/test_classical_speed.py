@@ -19,7 +19,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
 from recon.voxels.iterative import Watch, solve
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 

@@ -13,7 +13,7 @@ import pytest
 import recon
 from recon.prep.counts import Counts
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from tests.bench.quality_cases import F32, OBJECTS, padded

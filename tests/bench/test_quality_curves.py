@@ -30,7 +30,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.held_out import choice_sweeps
 from recon.voxels.projector import data_residual
 from recon.warm_up import warm_up
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from tests.bench.spheres import spheres

@@ -1,4 +1,4 @@
-"""Films: grey images, such as the views of a scan, in an animated GIF, or in an MP4 where there is ffmpeg."""
+"""Films: grey images in an animated GIF, or in an MP4 where there is ffmpeg; and the Gaussians as a PLY file."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from PIL import GifImagePlugin, Image
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import whole_file
 from beamline.core.sinks import Warn
+from beamline.gaussians.model import Model
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
@@ -269,3 +270,26 @@ def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
     height, width = source.row_pitch_mm, source.pixel_size_mm
     ratio = 1.0 if height is None or width is None else height / width
     return FilmImages(shown, lambda: images(shown), lambda: images(few), ratio)
+
+
+def write_ply(path: Path, model: Model) -> None:
+    """The Gaussians as a binary PLY: x y z, scale_0..2 (standard deviations), rot_0..3 (w x y z), density.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses; nothing is left.
+    """
+    arrays, unit = model.gaussians.physical(), model.record.length_unit
+    names = ("x", "y", "z", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "density")
+    columns = (arrays["centres"], arrays["widths"], arrays["rotations"], arrays["densities"][:, None])
+    rows = np.concatenate(columns, axis=1).astype("<f4")
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment lengths in {unit}, densities in {model.record.unit}, kernel {model.gaussians.kernel}",
+        f"element vertex {len(rows)}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    with whole_file(path) as partial, partial.open("wb") as file:
+        file.write(("\n".join(head) + "\n").encode())
+        file.write(rows.tobytes())

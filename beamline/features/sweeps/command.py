@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import shlex
 from collections.abc import Mapping, Sequence
@@ -28,6 +26,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.sinks import Warnings
+from beamline.core.text import aligned, csv_text
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
 from beamline.report.metrics import METRICS
 from drivers.base.clock import SystemClock
@@ -161,8 +160,7 @@ def _run(
     trials: Trials, options: Sequence[SweptOption], path: Path, as_json: bool
 ) -> tuple[list[SweptSlice], Scores | None]:
     """Write the sheet and the table of the slices, as far as they were made."""
-    from beamline.features.sweeps.sheet import sweep_sheet
-    from beamline.features.sweeps.sweep import scores_of, sliced, sweep_slices
+    from beamline.features.sweeps.sweep import scores_of, sliced, sweep_sheet, sweep_slices
 
     slices: list[SweptSlice] = []
     first = trials[0][1]
@@ -224,13 +222,11 @@ def _remarks(
 
 def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     """CSV: values, the residual of views held out, whether the slice is the best one or alike, and seconds."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*slices[0].values, "residual_held_out", "verdict", "seconds"])
+    rows = [[*slices[0].values, "residual_held_out", "verdict", "seconds"]]
     for n, each in enumerate(slices):
         residual = "" if scores is None else f"{scores.shares[n]:.6g}"
-        writer.writerow([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
-    return out.getvalue()
+        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
+    return csv_text(rows)
 
 
 def _verdict(scores: Scores | None, n: int) -> str:
@@ -240,14 +236,11 @@ def _verdict(scores: Scores | None, n: int) -> str:
 
 
 def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    names = list(slices[0].values)
-    head = [*names, METRICS["residual_held_out"].label, "", "s"]
-    rows = [head]
+    rows = [[*slices[0].values, METRICS["residual_held_out"].label, "", "s"]]
     for n, each in enumerate(slices):
         residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
         rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
-    widths = [max(len(row[at]) for row in rows) for at in range(len(head))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return aligned(rows, ">")
 
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:

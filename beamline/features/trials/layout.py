@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,6 +14,7 @@ from beamline.core.events import TrialDone
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.shipped import version
+from beamline.core.text import csv_text
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.report.html import Picture, render
@@ -134,11 +133,8 @@ def records(table: TrialTable, layout: TableLayout) -> list[dict[str, Any]]:
 
 def to_csv(table: TrialTable, layout: TableLayout) -> str:
     """One line for each trial; a value that is not known is empty."""
-    out, rows = io.StringIO(), records(table, layout)
-    writer = csv.DictWriter(out, list(rows[0]) if rows else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue()
+    rows = records(table, layout)
+    return csv_text([list(rows[0]) if rows else [], *(row.values() for row in rows)])
 
 
 def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: SliceSheet) -> None:

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.jit import njit
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.samples.bodies.chords import depths
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack, view_of
 from simulators.samples.bodies.solids import Solid, kind_of

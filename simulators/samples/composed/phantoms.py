@@ -79,14 +79,14 @@ def _grey(where: str, entry: Any) -> tuple[Solid, str]:
 
 
 def _read(name: str, module: str) -> _Builder:
-    """The builder of a phantom that is read from a file: `sample_of` of the module, by its settings."""
+    """The builder of a phantom that is read from a file: `volume_sample` of VolumeSettings in the module."""
 
     def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
         found = import_module(module)
         settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
         if read is None:
             raise ValueError(f"{settings.file} cannot be read: no reader of such files was given")
-        phantom: Sample = found.sample_of(settings, read)
+        phantom: Sample = getattr(found, f"{name}_sample")(settings, read)
         return phantom
 
     return sample

@@ -25,7 +25,7 @@ from recon.splatting.splat import project as gaussian_views
 from recon.splatting.splat import voxelize
 from recon.voxels.fdk import fdk
 from recon.voxels.projector import Projector, data_residual, project
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Ellipsoid
 from tests.recon.kernels.voxels_reference import system_matrix

@@ -20,7 +20,7 @@ from drivers.base.clock import SystemClock
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from tests.beamline.storage.file_layout import names, paths, unmatched
 
 SCENE = """
