@@ -116,10 +116,10 @@ def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     packed = [(module, *each) for module, files in members for each in files.items() if each[0].endswith(".nbi")]
     for module, name, content in packed:
         try:
-            importlib.import_module(module)  # its types
-        except ImportError:
+            importlib.import_module(module)
+            _, index = _read(content)
+        except ImportError:  # a module of kernels, or of their types, that is no more
             continue
-        _, index = _read(content)
         # tv._dual_step-94.py311.nbi, voxelize._filler.locals.kernel-155.py311.nbi
         kernel = name.partition(".")[2].rsplit("-", 1)[0].replace(".locals.", ".<locals>.")
         signatures[module, kernel].update(key[0] for key in index)
