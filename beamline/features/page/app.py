@@ -79,11 +79,7 @@ class Strangers:
 
     def end(self, client: object) -> None:
         """Close a connection, if it is still one of these."""
-        self._ends.pop(client, _nothing)()
-
-
-def _nothing() -> None:
-    """There is nothing to close."""
+        self._ends.pop(client, lambda: None)()
 
 
 @dataclass(frozen=True)

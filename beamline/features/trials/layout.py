@@ -45,6 +45,23 @@ class TableColumn:
     metric: bool = False
 
 
+def metric_column(
+    name: str,
+    value: Callable[[Outcome], float | None],
+    shown: Callable[[float], str],
+    heading: str,
+    short: str,
+    width: int,
+) -> TableColumn:
+    """The column of a figure of merit; `shown`: a value in words."""
+
+    def in_words(outcome: Outcome) -> str:
+        known = value(outcome)
+        return "–" if known is None else shown(known)
+
+    return TableColumn(name, value, heading, short, width, in_words, metric=True)
+
+
 @dataclass(frozen=True)
 class TableLayout:
     """What a table compares, and how it is written.

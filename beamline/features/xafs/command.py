@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +31,7 @@ from drivers.base.clock import SystemClock
 if TYPE_CHECKING:
     from beamline.core.flag import PixelBox
     from beamline.features.xafs.results import XafsResult
-    from beamline.features.xafs.series import CurveJob, CurveOptions, SeriesResult
+    from beamline.features.xafs.series import CurveJob, SeriesResult
 
 _OF_SCENES = ("step", "material", "angle", "seed", "charges")
 _OF_FILES = ("regions", "around", "unit", "quantity")
@@ -139,7 +138,6 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
     picture and table are written, too.
     """
     from beamline.features.xafs.results import refuse_existing_results
-    from beamline.features.xafs.series import CurveOptions
 
     target = output or Path(f"{Path(sources[-1]).stem}_xafs.png")
     if target.suffix.lower() != ".png":
@@ -149,11 +147,10 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
         return
     _refuse_given(_OF_MAPS, "a map of volumes: give --volume PATH, too")
     jobs = [job for source in sources for job in _jobs(source, values["regions"], values["charges"])]
-    options = CurveOptions(**{field.name: values[field.name] for field in fields(CurveOptions)})
     stop = StopRequest()
     with json_events(as_json) as json_sink, stop_signals(stop):
         refuse_existing_results(target)
-        results, stopped = _curves(jobs, options, stop, json_sink if as_json else None)
+        results, stopped = _curves(jobs, values, stop, json_sink if as_json else None)
         shown_lines = _write(results, len(jobs), target, stopped, json_sink)
     if not as_json:
         click.echo("\n".join(shown_lines))
@@ -167,7 +164,7 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
 
 
 def _curves(
-    jobs: Sequence[CurveJob], options: CurveOptions, stop: StopRequest, json_sink: Sink | None
+    jobs: Sequence[CurveJob], given: Mapping[str, Any], stop: StopRequest, json_sink: Sink | None
 ) -> tuple[list[XafsResult], bool]:
     """The edges of the curves, and whether a stop left some of them out.
 
@@ -180,7 +177,7 @@ def _curves(
     results: list[XafsResult] = []
     with Terminal(sys.stderr) as terminal:
         for job in jobs:
-            run, title = run_job(job, options, len(jobs) > 1, json_sink or terminal, stop)
+            run, title = run_job(job, given, len(jobs) > 1, json_sink or terminal, stop)
             try:
                 results.append(_result(title, run))
             except ScanStopped:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,35 +175,26 @@ class CurveJob:
         return Path(self.source).suffix.lower() in _SCENES and not Path(self.source).is_dir()
 
 
-@dataclass(frozen=True)
-class CurveOptions:
-    """The options that hold for all curves, as they were given; None: not given."""
-
-    low: float | None
-    high: float | None
-    step: float | None
-    material: str | None
-    angle: float | None
-    seed: int | None
-    around: PixelBox | None
-    unit: str | None
-    quantity: str | None
-
-
 def run_job(
-    job: CurveJob, given: CurveOptions, several: bool, sink: Sink, stop: StopRequest
+    job: CurveJob, given: Mapping[str, Any], several: bool, sink: Sink, stop: StopRequest
 ) -> tuple[SeriesResult, str]:
-    """The curve of a job and its name; a name tells one of several jobs from the others."""
+    """The curve of a job and its name; a name tells one of several jobs from the others.
+
+    Args:
+        given: options of `beamline xafs` for all curves, by the names of their parameters; None: not given.
+    """
     from beamline.features.xafs.measured import FileOptions, open_series  # it takes radiographs from here
 
-    source, low, high = job.source, given.low, given.high
+    source, low, high = job.source, given["low"], given["high"]
     with ExitStack() as opened:
         series: Series | XafsCurve
         if job.is_scene:
             from beamline.features.xafs.energy_scan import open_energy_scan  # xraylib, which no measured file needs
 
-            energies, angle = _grid(low, high, given.step or 0.001), math.radians(given.angle or 0.0)
-            series = open_energy_scan(source, energies, given.material, angle, given.seed or 0, job.charge).series()
+            energies, angle = _grid(low, high, given["step"] or 0.001), math.radians(given["angle"] or 0.0)
+            series = open_energy_scan(
+                source, energies, given["material"], angle, given["seed"] or 0, job.charge
+            ).series()
         else:
             from beamline.scan.energies import is_series, scans_in
 
@@ -215,7 +206,9 @@ def run_job(
                     f"{folder} is no folder of a series of scans (scan.energies); expected one, a file or a scene. "
                     "Nothing was written."
                 )
-            options = FileOptions(low or 0.0, high or math.inf, job.region, given.around, given.unit, given.quantity)
+            options = FileOptions(
+                low or 0.0, high or math.inf, job.region, given["around"], given["unit"], given["quantity"]
+            )
             series = opened.enter_context(open_series(folder, options, scans))
             n = series.energies.size if isinstance(series, XafsCurve) else series.n
             if n < LEAST:

@@ -26,7 +26,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from simulators.samples.materials.materials import known
-from tests.beamline.features.materials.test_command import ENERGIES, spectra
+from tests.beamline.features.materials.test_command import ENERGIES, scans, spectra  # noqa: F401 - scans is a fixture
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
@@ -59,7 +59,7 @@ def at_energies(files: list[Path], table: Path) -> EnergyScans:
     return EnergyScans(tuple(map(SourceOptions, files)), read_spectra(table))
 
 
-def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:
+def test_views_of_energies_keep_their_energies(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
     pytest.importorskip("xraylib")
     several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "charged"))
     data, table = planned(asked(scans[0], 31.5), several, lambda said: None)
@@ -84,13 +84,12 @@ def test_a_folder_that_exists_is_refused_before_scans_are_read(tmp_path: Path) -
         planned(asked(tmp_path / "none.h5", 1.0), several, print)
 
 
-def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:
+def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: Path) -> None:  # noqa: F811
     several = SeveralVolumes(scans=at_energies(scans, spectra(tmp_path)), states=("fresh", "full"))
     with pytest.raises(ConfigError, match="materials fresh, charged"):
         planned(asked(scans[0], 31.5), several, print)
 
 
-TRADEOFF_COMMAND_SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
 
 
 @pytest.fixture(autouse=True)
@@ -101,7 +100,7 @@ def _nothing_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    write_exchange(tmp_path / "scan.h5", TRADEOFF_COMMAND_SCAN)
+    write_exchange(tmp_path / "scan.h5", SCAN)
     return tmp_path
 
 
