@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,8 +100,9 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         return _told(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
-    noise = _mass_noise(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
-    laws = [_upside_down(shown, frames), _masses(shown, angles, frames, noise)]
+    of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
+    shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
+    laws = [_upside_down(shown, frames), _masses(shown, angles, frames, of_mass)]
     if not laws[1].broken:  # such views spoil the other moments
         near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
         laws += [_across(shown), _heights(shown)]
@@ -162,14 +163,19 @@ def _air_is_off(data: F32, some: NDArray[np.intp]) -> bool:
     return deepest < _FAINT or float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
 
 
-def _mass_noise(prepared: PreparedProjections, views: Sequence[F32]) -> float:
-    """Standard deviation of a view's mass by the noise of its pixels, and by that of the air it was divided by."""
+def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[float, float]:
+    """Standard deviations of a view's mass, by the noise of its pixels and of the air it was divided by, and of its
+    centre of mass in columns, by the slope of the line through that air, which all rows share."""
     mass = float(np.median([view.sum(dtype=np.float64) for view in views]))
+    if not mass > 0:
+        return np.inf, np.inf
     rows, cols = views[0].shape
-    air = rows * sum(prepared.projections.air_columns)
-    pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / air if air else 0.0)
+    air = [rows * columns for columns in prepared.projections.air_columns if columns]
+    pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / sum(air) if air else 0.0)
+    slope = rows * cols**2 / 12 * float(np.sqrt(sum(1 / n for n in air))) if len(air) > 1 else 0.0
     some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]  # that it reads: all together may not fit
-    return noise_level(np.stack(some)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
+    noise = noise_level(np.stack(some)) / mass
+    return noise * float(np.sqrt(pixels)), noise * slope
 
 
 def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]) -> Law:

@@ -116,9 +116,9 @@ def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     packed = [(module, *each) for module, files in members for each in files.items() if each[0].endswith(".nbi")]
     for module, name, content in packed:
         try:
-            importlib.import_module(module)
+            importlib.import_module(module)  # its types
             _, index = _read(content)
-        except ImportError:  # a module of kernels, or of their types, that is no more
+        except (ImportError, AttributeError):  # a module or a type has another name now
             continue
         # tv._dual_step-94.py311.nbi, voxelize._filler.locals.kernel-155.py311.nbi
         kernel = name.partition(".")[2].rsplit("-", 1)[0].replace(".locals.", ".<locals>.")

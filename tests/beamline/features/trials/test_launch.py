@@ -27,7 +27,7 @@ from beamline.features.trials.view_choices import ViewChoice
 from recon.base.geometry import Geometry
 from recon.base.method import Energies
 from recon.base.volume import Grid
-from recon.prep.emission import Emission
+from recon.prep.counts import Emission
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders
 
