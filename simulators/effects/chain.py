@@ -110,7 +110,7 @@ class Chain:
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
-        """Of an exposure. Without blur there is one, the middle of the exposure, as a reconstruction assumes."""
+        """Moments of an exposure. Without blur there is one, its middle, as a reconstruction assumes."""
         moments = Moments.once(shot.detector.shape[0], shot.exposure / 2)
         for effect in self.effects:
             if isinstance(effect, SamplingEffect):

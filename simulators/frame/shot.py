@@ -190,7 +190,7 @@ class Moments:
 
     @classmethod
     def once(cls, rows: int, seconds: float = 0.0) -> Moments:
-        """All rows so long after the trigger."""
+        """One moment for all rows, `seconds` after the trigger."""
         return cls(np.full((1, rows), seconds), np.ones(1))
 
 

@@ -18,7 +18,7 @@ from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
-    """The files that names and patterns mean, each once, in the order of the names."""
+    """Files that match names and patterns, each once, in the order given."""
     from beamline.storage.interrupted import scan_file  # here: help needs none of it
 
     scans: dict[Path, None] = {}

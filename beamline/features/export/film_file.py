@@ -68,7 +68,7 @@ class FilmStyle:
 
 @dataclass(frozen=True)
 class WrittenFilm:
-    """What a film that was written shows: so many images of (rows, cols), images a second, and the grey window."""
+    """A written film: number of images, their shape (rows, cols), images a second, and the grey window."""
 
     images: int
     shape: tuple[int, int]
@@ -77,7 +77,7 @@ class WrittenFilm:
 
 
 def thinned(n: int) -> range:
-    """Every k-th of n, so that they are MOST_IMAGES at most."""
+    """Every k-th of n images, at most MOST_IMAGES."""
     return range(0, n, math.ceil(n / MOST_IMAGES))
 
 
@@ -145,7 +145,7 @@ def write_film(path: Path, images: FilmImages, style: FilmStyle, progress: Calla
 
 
 def resized(image: F32, shape: tuple[int, int]) -> F32:
-    """An image with so many rows and columns: where there are fewer, each is the mean of what it covers."""
+    """The image averaged down to a shape (rows, cols)."""
     if image.shape == shape:
         return image
     whole = Image.fromarray(np.ascontiguousarray(image, np.float32))
@@ -237,7 +237,7 @@ _LOOKED_AT_VIEWS = 9  # views that tell the grey window
 
 
 def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
-    """The views of a scan by flats and darks, binned where that leaves `side` pixels or more; those unlit are left out.
+    """Corrected views of a scan by angle, binned where that leaves `side` pixels or more; unlit ones are left out.
 
     Raises:
         DataError: it has no view whose angle is known; while the images are read: none of these views can be used.

@@ -38,7 +38,7 @@ Progress = Callable[[int, int], None]  # Is told how many of how many frames are
 
 
 def volume_findings(record: ReconRecord) -> Iterator[Finding]:
-    """What the rules find in a volume; every slice of it is read."""
+    """Findings in a volume; every slice is read."""
     data, n = record.volume.data, record.volume.grid.shape[0]
     bad, first, low, high = 0, None, np.inf, -np.inf
     for z in range(n):
@@ -65,7 +65,7 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
 
 
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
-    """Everything that the rules find in a file, worst first; [] for a scan without fault.
+    """All findings in a file, the worst first; [] for a scan without fault.
 
     Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
 
@@ -101,7 +101,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
-    """What the rules of scans find in an open one, what is wrong with its references, and what is flagged."""
+    """Findings in an open scan: its content, its references, and its flagged frames."""
     findings = list[Finding]()
     for rule in (*SOURCE_RULES, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:

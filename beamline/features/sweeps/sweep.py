@@ -103,7 +103,7 @@ class Scores:
 
     @property
     def alike(self) -> list[bool]:
-        """Which slices are told from the best one by no more than chance; also the best one itself."""
+        """Which slices differ from the best by no more than chance; the best is one of them."""
         if self.best is None:
             return [False] * len(self.residuals)
         best = self.residuals[self.best]
@@ -222,7 +222,7 @@ def _held_out(prepared: PreparedProjections) -> HeldOutViews:
 
 
 def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores | None:
-    """How well each volume predicts the views that none has learnt from; None where their pixels, or views, differ.
+    """Residual of each volume in the views held out; None where slices differ in pixels, or in all views held out.
 
     A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
     compared with them as every value corrects them, and the mean counts.

@@ -96,7 +96,7 @@ class TableLayout:
 
 
 def status_text(outcome: Outcome) -> str:
-    """What stands in place of figures."""
+    """Status and message of a trial without figures."""
     return f"{'left out' if outcome.trial.left_out else outcome.status}: {outcome.message}".rstrip(": ")
 
 

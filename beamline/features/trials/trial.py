@@ -142,7 +142,7 @@ def _in_words(name: str, value: Plain | None) -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial.
+    """Result of a trial.
 
     Attributes:
         status: only "done" comes with figures.

@@ -90,8 +90,6 @@ def test_states_that_are_no_materials_are_refused(scans: list[Path], tmp_path: P
         planned(asked(scans[0], 31.5), several, print)
 
 
-
-
 @pytest.fixture(autouse=True)
 def _nothing_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "compile_kernels", lambda *_: None)
