@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
 from beamline.cli.options import WholeRange, say
-from beamline.cli.page_beside import ACT, ENDS_WITHIN, LOOK
+from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
 from beamline.cli.selection_options import scan_options
-from beamline.cli.terminal import answering
+from beamline.cli.terminal import ACT, ENDS_WITHIN, LOOK, answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import RUNS
 from beamline.core.process import at_end_of

@@ -18,7 +18,7 @@ from beamline.core.text import csv_text
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.report.html import Picture, render
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 
 _WIDTH = 120  # characters
 
