@@ -18,9 +18,8 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.files import parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import describe
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 from beamline.storage.structure import dtype_of, require_held, shape_of
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume, write_volume

@@ -111,7 +111,7 @@ from beamline.config.load import load
 from beamline.core.errors import DataError
 from beamline.features.doctor.examine import locks
 from beamline.scan.preflight import dry_run
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
