@@ -8,26 +8,32 @@ from typing import Any
 from drivers.base.clock import Clock
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
-from simulators.wires.pi_gcs.wire import PiGcsBuild
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.stages.rig import FIGURES, StageRig
 
 COUNTS = 90_000
 USUAL: dict[str, Any] = FIGURES | {"axis": "1", "trigger_line": 2, "counts_per_turn": COUNTS}
 """Of the driver's settings."""
-CABLE = {"output": 2, "counts_per_turn": COUNTS}
+LATENCY = 0.002
+CABLE = {"output": 2, "latency": LATENCY, "counts_per_turn": COUNTS}
 """Of the controller: its cable is in output 2."""
+
+
+def controller(clock: Clock, line: TriggerLine, **build: Any) -> PiGcsController:
+    return flat(PiGcsBuild, **(CABLE | build)).controller(clock, line)
 
 
 class Rig(StageRig):
     """`heard` is every byte that the driver sent; `spoil` what becomes of a reply."""
 
-    latency = 0.002
+    latency = LATENCY
 
     def __init__(self, *, wire: dict[str, Any] | None = None, **build: Any) -> None:
         self.spoil: Callable[[bytes], bytes] = lambda reply: reply
         spoil = {"spoil": lambda number, reply: self.spoil(reply)}
-        super().__init__(PiGcsBuild, CABLE | {"latency": self.latency} | spoil | (wire or {}) | build)
+        super().__init__(PiGcsBuild, CABLE | spoil | (wire or {}) | build)
         self.heard = bytearray()
         self.unasked = bytearray()
         self._lost: list[tuple[bytes, bytes]] = []
