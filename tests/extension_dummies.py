@@ -117,7 +117,7 @@ class Dummy:
         return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
 '''
     },
-    (("beamline/monitor/checks.py", '    "dark": "DarkCheck",', '    "dummy": "Dummy",'),),
+    (("beamline/monitor/checks.py", '    "DarkCheck": "frames",', '    "Dummy": "dummy",'),),
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError

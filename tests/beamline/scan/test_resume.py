@@ -32,8 +32,8 @@ from beamline.scan.run import run_scan
 from beamline.scan.states import State
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, joined_file_of
+from beamline.storage.readers.changed import OverlaidSource
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.writer_lock import QUIET, WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter

@@ -21,21 +21,8 @@ from beamline.storage.volumes.images import tiff
 from tests.beamline.storage.volumes.test_files import RECORD
 
 NUMBERS: tuple[Any, ...] = (
-    0,
-    -1,
-    1.5,
-    "abc",
-    None,
-    True,
-    [],
-    {},
-    2**31,
-    2**62,
-    10**4000,
-    -(10**400),
-    1e300,
-    "9" * 5000,
-)
+    0, -1, 1.5, "abc", None, True, [], {}, 2**31, 2**62, 10**4000, -(10**400), 1e300, "9" * 5000,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("n", NUMBERS, ids=range(len(NUMBERS)))
