@@ -30,8 +30,9 @@ from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.core.flag import PixelBox
+    from beamline.features.xafs.curves import CurveJob
     from beamline.features.xafs.results import XafsResult
-    from beamline.features.xafs.series import CurveJob, SeriesResult
+    from beamline.features.xafs.series import SeriesResult
 
 _OF_SCENES = ("step", "material", "angle", "seed", "charges")
 _OF_FILES = ("regions", "around", "unit", "quantity")
@@ -171,7 +172,7 @@ def _curves(
     Raises:
         ScanStopped: before there was one.
     """
-    from beamline.features.xafs.series import run_job
+    from beamline.features.xafs.curves import run_job
 
     stopped = False
     results: list[XafsResult] = []
@@ -200,7 +201,7 @@ def _write(results: Sequence[XafsResult], jobs: int, target: Path, stopped: bool
 
 
 def _jobs(source: str, regions: Sequence[PixelBox], charges: Sequence[float] | None) -> list[CurveJob]:
-    from beamline.features.xafs.series import CurveJob
+    from beamline.features.xafs.curves import CurveJob
 
     if CurveJob(source).is_scene:
         _refuse_given(_OF_FILES, "measured files, not for scenes")

@@ -105,7 +105,7 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
 
         return run_series(Series(series.title, series.n, frames(), series.regions), sink, clock, stopped)
 
-    monkeypatch.setattr("beamline.features.xafs.series.run_series", interrupted)
+    monkeypatch.setattr("beamline.features.xafs.curves.run_series", interrupted)
     result = _beamline("edge_scan", "--from", "8.335", "--to", "8.365")
     assert result.exit_code == 4, result.output
     assert f"Stopped after {energies} energies" in result.stderr
