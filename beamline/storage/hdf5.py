@@ -107,7 +107,9 @@ def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None
     return [way for way in ways if not (way[0] and waits)]
 
 
-def _unopened(path: Path, follow: bool, head: Superblock | None, problems: list[OSError | ValueError]) -> DataError:
+def _unopened(
+    path: Path, follow: bool, head: Superblock | None, problems: list[OSError | RuntimeError | ValueError]
+) -> DataError:
     """Why none of the ways opened a file."""
     if follow:
         return NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")

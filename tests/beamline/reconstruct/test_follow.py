@@ -340,6 +340,7 @@ def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch:
     assert h5py.is_hdf5(tmp_path / "recon.h5")
 
 
+@pytest.mark.slow
 def test_volume_is_of_the_whole_selection(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(replace(INTERLACED, shape=(4, 40))))

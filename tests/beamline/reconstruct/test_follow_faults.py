@@ -86,6 +86,7 @@ def _spoiled(frames: list[Frame], bad: set[int]) -> list[Frame]:
     return [replace(f, counts=f.counts // 40) if f.index in bad else f for f in frames]
 
 
+@pytest.mark.slow
 def test_half_of_the_views_with_an_alarm(tmp_path: Path) -> None:
     frames, bad = frames_of(INTERLACED), set(range(4, 34, 2))
     good = _numbered([frame for frame in frames if frame.index not in bad])

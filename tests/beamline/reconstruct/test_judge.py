@@ -47,6 +47,7 @@ def figures(scan: Path, folder: Path, method: str, axis_col: float) -> ReconReco
     return done.record
 
 
+@pytest.mark.slow
 def test_snr_and_cnr_of_fbp_are_the_same_beside_every_method(scan: Path, tmp_path: Path) -> None:
     alone = figures(scan, tmp_path, "fbp", 23.5).metrics
     assert "unexplained" not in alone  # the blur of its filter tells nothing
@@ -58,6 +59,7 @@ def test_snr_and_cnr_of_fbp_are_the_same_beside_every_method(scan: Path, tmp_pat
         assert {name: beside[name] for name in ("snr", "cnr")} == {name: alone[name] for name in ("snr", "cnr")}
 
 
+@pytest.mark.slow
 def test_a_better_axis_gives_no_worse_contrast(scan: Path, tmp_path: Path) -> None:
     """Regions of the better FBP differ from those of the worse one; the figures follow the volume, not the regions."""
     for method in ("fbp", "fista-tv"):

@@ -272,6 +272,7 @@ def _volume(path: Path) -> np.ndarray:
     return read_reconstruction(path).volume.data
 
 
+@pytest.mark.slow
 def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None:
     """Ended after some steps, begun again from its file: the same volume to the bit, with views held out as well."""
     selection = Selection(views="fixed:20", axis_col=SCAN.axis_col)

@@ -98,6 +98,7 @@ def test_the_partial_volume_becomes_the_output_where_it_lies(folder: Path, monke
     assert Path("out.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [OSError("the disk is full"), KeyboardInterrupt()])
 def test_a_volume_that_could_not_be_completed_is_resumed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
@@ -156,6 +157,7 @@ def test_other_data_or_options_are_refused_and_nothing_is_touched(
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of three slabs: that much of the time, and no disk for the slabs that are there. The file stays as it is."""
     with monkeypatch.context() as patch:

@@ -64,6 +64,7 @@ def test_the_volume_is_the_same_to_the_bit(tmp_path: Path, memory: str, more: li
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
 
 
+@pytest.mark.slow
 def test_flags_and_line_integrals_as_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scan = TwoCylinders(shape=(150, 40))
@@ -93,6 +94,7 @@ def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pyt
     assert peak < 40e6
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("tall")
 @pytest.mark.parametrize(
     ("method", "more", "memory", "near"),
@@ -115,6 +117,7 @@ def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str]
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "memory", "shape"),
     [("os-sirt-tv", 44, (320, 96)), pytest.param("cgls", 56, (200, 256), marks=pytest.mark.slow)],
@@ -201,6 +204,7 @@ def test_a_run_follows_the_plan_of_its_dry_run(words: str) -> None:
     assert told["slabs"] == int(str(made.get("slabs", 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("tall")
 def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over(
     monkeypatch: pytest.MonkeyPatch,
@@ -216,6 +220,7 @@ def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over
     assert seen[-1][0].width.arc == pytest.approx(np.radians(4)) and seen[-1][0].skew != 0
 
 
+@pytest.mark.slow
 def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaussians are placed in matter; the views of a slab without any may even be below zero on average."""
     monkeypatch.chdir(tmp_path)
