@@ -15,7 +15,6 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
-from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
@@ -26,6 +25,7 @@ from recon.base.units import look_negative
 from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import covers_the_circle
 
 _VIEWS = 180  # more do not sharpen the moments, they only cost reading
@@ -94,7 +94,8 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     if not whole or few or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
-    if cut_sides(data, geometry) or _air_is_off(data, some):
+    edges = FieldEdges.of(data, geometry)
+    if edges.beyond() or edges.passing() or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         return _told(laws, warn)

@@ -26,7 +26,7 @@ from beamline.projections.refusals import checked_views
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
-from beamline.projections.truncation import cut_sentence, cut_sides
+from beamline.projections.truncation import cut_sentence, passing_sentence
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.view_geometry import ViewGeometry
 from beamline.storage.readers.averaged import JOINED_DEG
@@ -39,6 +39,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
 _SAME_AXIS = 0.05  # columns
@@ -286,10 +287,13 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    if sides := cut_sides(projections.data, geometry):
+    edges = FieldEdges.of(projections.data, geometry)
+    if sides := edges.beyond():
         warn(cut_sentence(sides))
         if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
             warn(change)
+    elif ranges := edges.passing():
+        warn(passing_sentence(ranges, geometry.n_views))
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")
