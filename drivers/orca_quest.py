@@ -12,16 +12,13 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
 from drivers.base.protocols import CameraSettings, CameraTiming
 from drivers.flat import MEGABYTES, key
 from recon.base.registry import unknown
 
-Share = Annotated[float, Field(gt=0, le=1)]
 SENSOR_SHAPE = (2304, 4096)
 PITCH_MM = 4.6e-3
 BITS = 16
@@ -43,7 +40,6 @@ LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpre
 QE_NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
 QE = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.40, 0.33, 0.30, 0.20, 0.09)
 """Quantum efficiency of ORCA-Quest 2 at QE_NM, off the catalogue's figure: 600 to 800 nm may be 0.1 to 0.15 too low."""
-Nanometres = Annotated[float, Field(ge=QE_NM[0], le=QE_NM[-1])]
 
 
 def quantum_efficiency(wavelength_nm: float) -> float:
@@ -64,12 +60,20 @@ class LightPath:
         wavelength_nm: of the light.
     """
 
-    absorbed: Share
-    light: Annotated[float, Field(gt=0, le=1e6)]
-    aperture: Annotated[float, Field(gt=0, lt=1)]
-    index: Annotated[float, Field(ge=1, le=4)] = 1.84
-    transmission: Share = 0.9
-    wavelength_nm: Nanometres = 535.0
+    absorbed: float
+    light: float
+    aperture: float
+    index: float = 1.84
+    transmission: float = 0.9
+    wavelength_nm: float = 535.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("absorbed", 1e-6, 1.0), ("light", 1e-3, 1e6), ("aperture", 1e-3, 0.999), ("index", 1.0, 4.0),
+            ("transmission", 1e-6, 1.0), ("wavelength_nm", QE_NM[0], QE_NM[-1]),
+        ):  # fmt: skip
+            if not low <= (value := getattr(self, name)) <= high:
+                raise ValueError(f"{name} lies in {low:g} ... {high:g}, got {value:g}")
 
     @property
     def collected(self) -> float:

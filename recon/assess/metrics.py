@@ -302,7 +302,10 @@ def contrast(truth: Array, volume: Array) -> dict[str, float]:
     mean = float(volume[body].mean()) if body.any() else 0.0
     if not mean > 0:
         return {}
-    figures = {"rmse": float(np.sqrt(_squared_error(truth, volume) / truth.size)), "variation": float(volume[body].std()) / mean}
+    figures = {
+        "rmse": float(np.sqrt(_squared_error(truth, volume) / truth.size)),
+        "variation": float(volume[body].std()) / mean,
+    }
     if hot.any():
         ratio = float(volume[hot].mean()) / mean
         figures["recovery"] = (ratio - 1) / (float(truth[hot].mean()) / level - 1)

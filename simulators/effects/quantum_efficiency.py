@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from drivers.orca_quest import LightPath, Nanometres, quantum_efficiency
+from pydantic import Field
+
+from drivers.orca_quest import QE_NM, LightPath, quantum_efficiency
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import Share
 from simulators.frame.shot import Image, Shot
@@ -25,7 +28,7 @@ class QuantumEfficiency(ImageEffect):
     """
 
     value: Share | None = None
-    wavelength_nm: Nanometres | None = None
+    wavelength_nm: Annotated[float, Field(ge=QE_NM[0], le=QE_NM[-1])] | None = None
     path: LightPath | None = None
 
     def __post_init__(self) -> None:
