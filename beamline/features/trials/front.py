@@ -42,7 +42,7 @@ _FIGURES = {
     "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", _digits("ssim3d")),
     "rmse": _Figure("RMSE", "RMSE", "of the activity", _digits("rmse")),
     "signal_to_background": _Figure("S/B", "signal/background", "hot regions over the body", _digits("recovery")),
-    "sbr_error": _Figure("S/B error", "its largest error", "of a hot region, relative", _digits("sbr_error")),
+    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", _digits("sbr_error")),
     "recovery": _Figure("hot", "contrast recovery", "contrast of hot regions over the truth's", _digits("recovery")),
     "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", _digits("spillover")),
     "variation": _Figure("noise", "noise", "standard deviation of the body over its level", _digits("variation")),
