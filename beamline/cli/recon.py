@@ -15,19 +15,17 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
-from beamline.cli.option_groups import Grouped
 from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, require_there, rules_of
-from beamline.cli.recipe import names_given, recipe_text, repeating
+from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
 from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
-from beamline.core.narration import sentence
 from beamline.core.process import EndsWithParent
 from beamline.core.shipped import version
-from beamline.core.sinks import fan_out, while_it_works
+from beamline.core.sinks import fan_out, sentence, while_it_works
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import printable
 from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods

@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from beamline.config.devices import DcamOrca
-from beamline.config.errors import explain
 from beamline.config.models import Config as Config
 from beamline.config.models import (
     Fields,
@@ -27,12 +26,12 @@ from beamline.config.models import (
     SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
-from beamline.config.tree import Tree, override, read
+from beamline.config.tree import Tree, declared_at, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.shipped import config_folder as config_folder
 from beamline.core.shipped import version
-from beamline.plan import angles
+from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
@@ -88,27 +87,9 @@ def load(
 
 def takes_text(keys: Sequence[str]) -> bool:
     """Whether a key of the configuration takes any text, and nothing else but null."""
-    types: set[Any] = {Config}
-    for key in keys:
-        models: list[type[BaseModel]] = [
-            each for each in types if isinstance(each, type) and issubclass(each, BaseModel)
-        ]
-        types = {
-            member
-            for model in models
-            if key in model.model_fields
-            for member in _alternatives(model.model_fields[key].annotation)
-        }
-    return str in types and types <= {str, NoneType}
-
-
-def _alternatives(annotation: Any) -> list[Any]:
-    """The types of an annotation."""
-    if get_origin(annotation) is Annotated:
-        return _alternatives(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, UnionType):
-        return [each for part in get_args(annotation) for each in _alternatives(part)]
-    return [annotation]
+    legal = declared_at(schema(), tuple(keys), None)
+    kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
+    return "string" in kinds and kinds <= {"string", "null"}
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
@@ -176,6 +157,7 @@ def resolved_yaml(config: Config) -> str:
     return f"# splatline {version()}\n{body}"
 
 
+@cache
 def schema() -> dict[str, Any]:
     """JSON schema of a configuration file."""
     return Config.model_json_schema()
@@ -224,25 +206,27 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+        raise ConfigError(
+            f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
+        ) from None
     return read(text, str(path)).data
 
 
 def _angles(plan: Any) -> NDArray[np.float64]:
     match plan:
         case SectorAngles():
-            return angles.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
+            return plans.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
         case FileAngles():
-            return angles.from_text(text_in(Path(plan.path)))
+            return plans.from_text(text_in(Path(plan.path)))
     start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
     match plan:
         case RandomAngles():
-            return angles.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
+            return plans.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
         case InterlacedAngles():
-            return angles.interlaced(plan.views, plan.passes, start, span)
+            return plans.interlaced(plan.views, plan.passes, start, span)
         case GoldenAngles():
-            return angles.golden(plan.views, start, span)
-    return angles.fixed(plan.views, start, span)
+            return plans.golden(plan.views, start, span)
+    return plans.fixed(plan.views, start, span)
 
 
 def _field(fields: Fields, exposure: float) -> FieldPlan:

@@ -1,20 +1,21 @@
-"""Consistency: laws that hold for all views of a sample at rest, and what the views leave of them."""
+"""Consistency: laws that hold for all views of a sample at rest, and the warning of one wider than the field."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
+from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
+from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
@@ -98,21 +99,22 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     if edges.beyond() or edges.passing() or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
-        return _told(laws, warn)
+        return _reported(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
-    noise = _mass_noise(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
-    laws = [_upside_down(shown, frames), _masses(shown, angles, frames, noise)]
+    of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
+    shown = replace(shown, across_sigma=float(np.hypot(shown.across_sigma, of_centre)))
+    laws = [_upside_down(shown, frames), _masses(shown, angles, frames, of_mass)]
     if not laws[1].broken:  # such views spoil the other moments
         near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
         laws += [_across(shown), _heights(shown)]
         laws += [_angles(shown, geometry.angles)] if near else []
         laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
         laws += [_axis(shown, geometry.axis_col, selection)]
-    return _told(laws, warn)
+    return _reported(laws, warn)
 
 
-def _told(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
+def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
     for law in laws:
         if law.broken:
             warn(law.sentence)
@@ -163,14 +165,19 @@ def _air_is_off(data: F32, some: NDArray[np.intp]) -> bool:
     return deepest < _FAINT or float(np.percentile(edges, _MOST_OF_THEM[1])) > _AIR * deepest
 
 
-def _mass_noise(prepared: PreparedProjections, views: Sequence[F32]) -> float:
-    """Standard deviation of a view's mass by the noise of its pixels, and by that of the air it was divided by."""
+def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[float, float]:
+    """Standard deviations of a view's mass, by the noise of its pixels and of the air it was divided by, and of its
+    centre of mass in columns, by the slope of the line through that air, which all rows share."""
     mass = float(np.median([view.sum(dtype=np.float64) for view in views]))
+    if not mass > 0:
+        return np.inf, np.inf
     rows, cols = views[0].shape
-    air = rows * sum(prepared.projections.air_columns)
-    pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / air if air else 0.0)
+    air = [rows * columns for columns in prepared.projections.air_columns if columns]
+    pixels = rows * cols + ((rows * cols) ** 2 * np.pi / 2 / sum(air) if air else 0.0)
+    slope = rows * cols**2 / 12 * float(np.sqrt(sum(1 / n for n in air))) if len(air) > 1 else 0.0
     some = views[:: max(1, len(views) // NOISE_VIEWS)][:NOISE_VIEWS]  # that it reads: all together may not fit
-    return noise_level(np.stack(some)) * float(np.sqrt(pixels)) / mass if mass > 0 else np.inf
+    noise = noise_level(np.stack(some)) / mass
+    return noise * float(np.sqrt(pixels)), noise * slope
 
 
 def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]) -> Law:
@@ -310,3 +317,23 @@ def _axis(shown: ViewMoments, used: float, selection: Selection) -> Law:
     )
     off = abs(shown.axis_col - used) if selection.axis_col is not None else np.nan
     return Law("axis of the centres of mass", off, max(_AXES_AGREE, _SURE * shown.axis_sigma), "columns", sentence)
+
+
+def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
+    """A warning for `FieldEdges.passing`."""
+    words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
+    return (
+        f"Matter leaves the field {words} of {n_views}, and all of it is inside in others: the sample, or a part of "
+        "it, stands beside the rotation axis. What lies farther from the axis than the edge is not reconstructed, and "
+        "the rim is uncertain. Centre the sample on the axis, or move the camera until the axis is near its edge and "
+        "take a full turn."
+    )
+
+
+def cut_sentence(sides: dict[str, float]) -> str:
+    """The warning of a sample that goes on beyond the field, by `FieldEdges.beyond`."""
+    return (
+        f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "
+        "absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
+        "columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
+    )

@@ -21,7 +21,7 @@ from recon.base.method import Energies
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.prep.emission import Emission
+from recon.prep.counts import Emission
 from recon.voxels.projector import seen_rays
 
 
@@ -231,7 +231,6 @@ def hold_out(
     count = count if most is None else min(count, most)
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
-    # Neither the first nor the last: they have a neighbour on one side only.
     # Neither the first nor the last: they have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     return with_views_held_out(prepared, held)

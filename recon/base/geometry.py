@@ -34,10 +34,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F64
-from recon.base.declared_types import check_arguments
-from recon.base.picture import fan, html
+from recon.base.declared_types import check_arguments, check_settings
+from recon.base.greys import fan, html
 from recon.base.ray_width import NO_WIDTH, RayWidth
-from recon.base.settings_check import check_settings
 
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
@@ -367,7 +366,7 @@ class Geometry:
         return replace(self, **lengths, centres=_frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same views, whose rays have a width and whose rows were read one after the other.
+        """The same views with rays of a width, and a skew from row to row (rolling shutter).
 
         Raises:
             ValueError: a skew that is not finite, or of a cone, or of rolled or tilted views: slices of the volume then
@@ -376,7 +375,7 @@ class Geometry:
         return replace(self, width=width, skew=float(skew))
 
     def about(self, centres: ArrayLike) -> Geometry:
-        """The same views of a cone about other points of the object, [view, 3] in mm; see `centres`.
+        """The same views of a cone with other centres, [view, 3] in mm; see `centres`.
 
         Raises:
             ValueError: not finite, another shape, or of a parallel beam.
@@ -427,6 +426,12 @@ class Geometry:
             width=self.width.binned(factor),
             skew=self.skew * factor,
         )
+
+
+def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
+    """Raise ValueError unless the values are [view, row, col] of the geometry's views."""
+    if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):
+        raise ValueError(f"{name} have shape {shape}, the geometry says {expected} [view, row, col]")
 
 
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:

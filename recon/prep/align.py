@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter1d
 
 from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
-from recon.prep.axis_search import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
-from recon.prep.axis_search import AxisError as AxisError
-from recon.prep.axis_search import AxisEstimate as AxisEstimate
+from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
+from recon.prep.axis_wedge import AxisError as AxisError
+from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
@@ -111,7 +111,7 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
 
 
 def _vertex(candidates: Floats, curve: Floats, best: int) -> float:
-    """Of the parabola through the curve at three candidates."""
+    """Vertex of the parabola through the curve at three candidates."""
     near = slice(max(best - 1, 0), best + 2)
     return lowest(candidates[near], curve[near])[0]
 
@@ -209,7 +209,7 @@ class _Mirrored:
 
 
 def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """As `wedge_curves`, by pairs of opposite views.
+    """`wedge_curves` by pairs of opposite views.
 
     Raises:
         ValueError: see `axis_from_opposites`.

@@ -103,7 +103,7 @@ def _down(mass: F64) -> tuple[F64, float]:
 
 
 def _moved(mass: F64) -> tuple[F64, float]:
-    """`_down` by some rows; NaN where they do not tell."""
+    """`_down` by some rows; NaN where they do not determine it."""
     views, rows = mass.shape
     unknown = np.full(views, np.nan), np.nan
     if rows < _LEAST_ROWS:
@@ -177,10 +177,11 @@ class _Orders:
 
         Args:
             every: 2 for the multiples of the angle of the order's parity, 1 for all.
-            alike: how much orders disagree is uncertainty, too.
+            alike: how much orders disagree is uncertainty, too, and bands that err alike, as by their air, count less.
         """
         n, bands = basis.shape[1] + 1, self.rounding.size
         normal, right, variances = np.zeros((_ORDERS, bands, n, n)), np.zeros((_ORDERS, bands, n)), 0.0
+        shared = 0.0
         for order, (moment, of_column) in enumerate(zip(self.moments, self.of_axis, strict=True), 1):
             multiples = np.arange(order % every, order + 1, every)[:, None]
             cosines, sines = np.cos(multiples * angles), np.sin(multiples * angles)
@@ -194,6 +195,7 @@ class _Orders:
             variance = np.maximum((rest**2).sum(axis=0) / (len(angles) - parts.shape[1]), self.rounding)
             normal[order - 1] = np.einsum("avb,cvb,b->bac", effects, effects, 1 / variance)
             right[order - 1] = np.einsum("avb,vb,b->ba", effects, rest, 1 / variance)
+            shared += bands * float(((rest / np.sqrt(variance)).mean(axis=1) ** 2).mean()) / _ORDERS
             variances += float(variance.sum() / max(float((moment**2).mean(axis=0).sum()), 1e-30))
         total, of_all = normal.sum(axis=(0, 1)), right.sum(axis=(0, 1))
         if np.linalg.matrix_rank(total) < n:
@@ -203,11 +205,11 @@ class _Orders:
             if count > 2:  # without each in turn: bands disagree where the sample moves, orders where it hardens
                 without = np.linalg.solve(total - normal.sum(axis), (of_all - right.sum(axis))[..., None])[:, :-1, 0]
                 sigma = np.maximum(sigma, np.sqrt((count - 1) * without.var(axis=0)))
-        return found, sigma, variances
+        return found, sigma * np.sqrt(max(shared, 1.0)) if alike else sigma, variances
 
 
 def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
-    """By how much more than stated the views turned, and its standard deviation.
+    """Relative excess of the turn over the stated one, and its standard deviation.
 
     A small error of the axis is fitted beside it. Of what is nearly a body of revolution that does not suffice: what
     pixels and the axis do to its moments looks like an error of the angles. So a second fit has all multiples of the

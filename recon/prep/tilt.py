@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 from recon.prep.align import opposite_curves
-from recon.prep.axis_search import FEWEST_BANDS, FEWEST_COLS
-from recon.prep.axis_wedge import wedge_curves
+from recon.prep.axis_wedge import FEWEST_BANDS, FEWEST_COLS, wedge_curves
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -82,7 +81,7 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
 
 
 def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
-    """The line by curves [band, candidate].
+    """The line through the axes of bands, from their mismatch [band, candidate].
 
     Raises:
         ValueError: it has no clear optimum.

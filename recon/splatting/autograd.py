@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu, Pass
 
 
 class On(NamedTuple):
-    """What raw parameters are of, and what computes them; `unit` is that of the densities."""
+    """Unit of the densities, kernel and backend of raw parameters."""
 
     unit: float
     kernel: Kernel

@@ -20,7 +20,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
+from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
@@ -28,10 +28,8 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.held_out import MOST_TRIALS, HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
-from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
+from recon.voxels.methods import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -50,7 +48,7 @@ _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
 class _Watch:
-    """Tells of sweeps, and asks whether to stop.
+    """Reports sweeps, and asks whether to stop.
 
     Attributes:
         ended: the last answer was yes.
@@ -79,9 +77,7 @@ class _Watch:
         return self.sweep(number, of, "sweeps on voxels")
 
     def sweep(self, number: int, of: int, unit: str) -> bool:
-        if self._control.on_progress is not None:
-            nan, seconds = math.nan, self._control.now() - self._begin
-            self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
+        self._control.tell_part(number, of, self._begin, self._n_views, unit)
         return self.asked()
 
 
@@ -91,7 +87,7 @@ Fit = Callable[[ReconProblem, RunControl, float], Reconstruction]
 
 @dataclass(eq=False)
 class Candidates:
-    """What candidates leave of views held out, [view] each; None: not tried.
+    """Residuals of views held out by each candidate, [view]; None: not tried.
 
     Attributes:
         direct, smooth, patches, fit: FBP, total variation, sparse patches, and a fit that the better of these refines.
@@ -106,7 +102,7 @@ class Candidates:
 
     @property
     def by_voxels(self) -> F64 | None:
-        """The least residual of the two priors."""
+        """The smaller residual of the two priors."""
         tried = [each for each in (self.smooth, self.patches) if each is not None]
         return min(tried, key=lambda each: float(each.mean()), default=None)
 
@@ -150,10 +146,10 @@ class _Planning:
 
     def of_fit(self, trial: HeldOutTrial, weight: float, strength: float, share: float) -> F64 | None:
         """Residuals [view held out] of a fit of the trial's views, refined with the prior; None: it refuses them."""
-        part, wide = trial.problem, trial.wide.seen()
-        seen, cols = wide.projector, trial.wide.cols
-        weights = None if wide.weight is None else projection_images(wide.weight)
-        views = ReconProblem(projection_images(wide.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
+        part, whole = trial.problem, trial.all_columns.seen()
+        seen, cols = whole.projector, trial.all_columns.cols
+        weights = None if whole.weight is None else projection_images(whole.weight)
+        views = ReconProblem(projection_images(whole.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -163,10 +159,10 @@ class _Planning:
             None if views is None else np.ascontiguousarray(projection_lines(views)[:, cols])
             for views in (
                 beyond_voxels(fitted.gaussians, geometry, fitted.volume.grid, self.settings)
-                for geometry in (seen.geometry, trial.wide.unseen)
+                for geometry in (seen.geometry, trial.all_columns.unseen)
             )
         )
-        refined = trial.made(
+        refined = trial.volume_by(
             lambda some, x: refine(
                 _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
             ),
@@ -228,7 +224,7 @@ def refine(
 
 
 def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fit: Fit) -> Candidates:
-    """What total variation, sparse patches and a fit leave of views held out, and the decisions on their prior.
+    """Residuals of views held out by total variation, sparse patches and a fit, and the decisions on their prior.
 
     The trials see sixteen rows. Each candidate predicts views by its whole model: Gaussians show what lies beyond the
     box, and edges within voxels, too. A fit of all views would know the views held out, so this one is of its own. It
@@ -339,7 +335,7 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
     if not (data.any() and model.any()):
         return None
     data, weights = _without_outliers(data, weights, model)
-    return data - ring_offsets(data - model, problem.geometry.axis_col), weights
+    return data - ring_offsets(data - model, problem.geometry), weights
 
 
 def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:

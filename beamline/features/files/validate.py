@@ -19,13 +19,14 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import darks_beside_views
-from beamline.storage.rules.references import VIEWS, reference_groups, references_usable, some_of
+from beamline.storage.rules.references import VIEWS, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
+from recon.base.views import spread
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
@@ -111,7 +112,7 @@ def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
     kinds = {FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION}
     if not counted or not kinds <= {*source.image_key.tolist()}:
         return
-    looked_at = views if every else some_of(views, VIEWS)
+    looked_at = views if every else spread(views, VIEWS)
     light = ViewLight.of(source, reference_groups(source).good())
     unlit = [row for row in looked_at.tolist() if light.unlit(row)]
     if unlit:

@@ -180,7 +180,9 @@ def _choice(label: str, taken: _Taken, instrument: _Instrument, begun: int) -> V
 def joined(parts: Sequence[PreparedProjections]) -> PreparedProjections:
     """The views of several scans of one set-up as those of one, without the width of their rays."""
     names = ("data", "view_ids", "air", *(() if parts[0].projections.weights is None else ("weights",)))
-    of_views = {name: np.concatenate([getattr(each.projections, name) for each in parts]) for name in names}
+    of_views: dict[str, Any] = {
+        name: np.concatenate([getattr(each.projections, name) for each in parts]) for name in names
+    }
     measured = [each.measured for each in parts if each.measured is not None]
     return replace(
         parts[0],

@@ -189,7 +189,8 @@ def against_cost(table: TrialTable, label: str, value: Value, costs: Mapping[str
                 same = [(cost(o), v) for o, v in pairs if _kind(o) == kind]
                 style, words = (f"{_KINDS[n % len(_KINDS)]}-", f"{method}, {kind}") if kind else ("o", method)
                 axes.plot(*zip(*same, strict=True), style, ms=4, lw=0.8, color=colour_of(method), label=words)
-        axes.set(xlabel=name, xscale="log")
+        axes.set_xlabel(name)
+        _scale(axes, [cost(outcome) for outcome in table.compared])
         axes.grid(alpha=0.3)
     panels[0].set_ylabel(label)
     if any(_kind(outcome) for outcome in table.compared):

@@ -28,7 +28,7 @@ from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewCh
 from beamline.projections.scan_statistics import dose_scale
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS, Metric
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32, F64

@@ -90,8 +90,8 @@ def with_dynamic_flats(
         ConfigError: there are too few flats.
     """
     from beamline.projections.read import read_binned, spoilt_frames
-    from recon.prep.defects import dead_pixels
     from recon.prep.dynamic_flats import find_dynamic_flats
+    from recon.prep.references import dead_pixels
 
     asked = selection.step(Preparation)
     frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))
@@ -128,13 +128,6 @@ def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDA
     if views.size == 0:
         return np.ones(values.size)
     return np.where(np.isfinite(values), np.median(views) / values, 1.0)
-
-
-def view_scale(source: ScanSource, by_current: bool) -> NDArray[np.float64] | None:
-    """`light_scale` of views; None where they are all exposed alike, and nobody asked for the ring current."""
-    from beamline.storage.rules.exposures import views_differ
-
-    return light_scale(source, by_current) if by_current or views_differ(source) else None
 
 
 def current_scale(source: ScanSource) -> NDArray[np.float64]:

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.angles import OTHER, PAIRS, UNLIKE, CoarseViews, coarse_views
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.references import VIEWS, some_of
+from beamline.storage.rules.references import VIEWS
+from recon.base.views import spread
 
 _FAR, _NEXT = 4.0, 1.5  # steps from which two views are stated to be apart, and up to which side by side
 _SINGLE = 0.1  # of the views: so few wrong angles are named one by one
+_AROUND, _RETRACED = 3, 1.5  # pairs about such frames; times a step: symmetric samples 0.1 to 1.2, two sides 1.75 to 3
 _MIRRORED = 0.5  # of 1: how alike sums of directions are, 0 where they spread evenly, as of frames taken in passes
 _MOST = 0.75  # of some views: as many look like others that are far from them, if the frames were in another order
 
@@ -63,18 +65,24 @@ def angles_in_order(source: ScanSource) -> Iterator[Finding]:
 def _mirrored_neighbours(seen: CoarseViews, rows: NDArray[np.int64]) -> tuple[int, int] | None:
     """Two frames that are stated side by side and look half a turn apart; None where none are. Rows by their angles.
 
-    A sample that is symmetric looks alike both ways, and one that moved looks unlike both ways.
+    A sample that is symmetric looks alike both ways, and one that moved looks unlike both ways. One with a plane of
+    symmetry retraces its views beyond it, mirrored, which frames of two sides do not.
     """
-    some = some_of(rows, VIEWS)
+    some = spread(rows, VIEWS)
     some = some[[seen.lit(row) for row in some.tolist()]]
     if some.size <= PAIRS:
         return None
+    pairs = list(zip(some[:-1].tolist(), some[1:].tolist(), strict=True))
     apart = np.diff(np.degrees(seen.source.angles[some]) % 360)
-    pairs = [(int(some[at]), int(some[at + 1])) for at in np.flatnonzero(apart <= _NEXT * np.median(apart))]
+    allowed = np.maximum(apart / np.median(apart[apart > 0]), 1) ** 2  # views differ by the square of a small turn
     unlike = np.array([seen.unlike([pair], False) for pair in pairs])
-    usual = float(np.median(unlike))
-    for at in np.flatnonzero(unlike > UNLIKE * usual)[:PAIRS].tolist():
-        if seen.unlike([pairs[at]], True) < min(2 * usual, unlike[at] / UNLIKE):
+    rate = np.pad(unlike / allowed, 2, mode="edge")
+    near = np.median(np.lib.stride_tricks.sliding_window_view(rate, 5), axis=1)  # some directions change faster
+    usual = np.maximum(near, np.median(rate))
+    for at in np.flatnonzero(unlike > UNLIKE * usual * allowed)[:PAIRS].tolist():
+        around = list(zip(some[at::-1].tolist(), some[at + 1 :].tolist(), strict=False))[:_AROUND]
+        retraced = len(around) == _AROUND and seen.unlike(around, True) < _RETRACED * usual[at]
+        if not retraced and seen.unlike([pairs[at]], True) < min(2 * usual[at] * allowed[at], unlike[at] / UNLIKE):
             return pairs[at]
     return None
 
@@ -86,8 +94,8 @@ def _apart(turned: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _lit(seen: CoarseViews, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """A few of the pairs of frames, evenly spread, with light."""
-    some = sorted({round(i * (len(pairs) - 1) / (PAIRS - 1)) for i in range(PAIRS)}) if pairs else []
-    return [pairs[i] for i in some if all(seen.lit(row) for row in pairs[i])]
+    some = [pairs[at] for at in spread(np.arange(len(pairs)), PAIRS)]
+    return [pair for pair in some if all(seen.lit(row) for row in pair)]
 
 
 def _stated(source: ScanSource, pair: tuple[int, int]) -> str:
@@ -118,7 +126,7 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Fin
     Of two measured scans (the tooth, Diamond) as if taken in 2, 3, 4 and 6 passes, 5 of 8 are told, those of
     two passes never; as they were taken, none.
     """
-    some = some_of(rows, VIEWS)
+    some = spread(rows, VIEWS)
     some = some[[seen.lit(row) for row in some.tolist()]]
     if some.size < PAIRS:
         return

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding, Severity
-from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups, some_of
+from beamline.storage.rules.references import VIEWS, reference_frame, reference_groups
 from beamline.storage.rules.unlit import LEAST, ViewLight, brightness
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_degrees
+from recon.base.views import spread
 
 FARTHEST = 1e6  # degrees
 _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
@@ -220,7 +221,7 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     if seen is None:
         return
     views = seen.rows[np.argsort(source.angles[seen.rows], kind="stable")]
-    some = some_of(views, VIEWS)
+    some = spread(views, VIEWS)
     some = some[[seen.lit(row) for row in some.tolist()]]
     degrees = np.degrees(source.angles)
     if some.size < _LEAST_SEEN or np.ptp(degrees[some]) == 0:
@@ -230,8 +231,7 @@ def angles_seen(source: ScanSource) -> Iterator[Finding]:
     chosen = np.flatnonzero(beside != some)
     if not chosen.size:
         return
-    chosen = chosen[np.unique(np.linspace(0, chosen.size - 1, PAIRS).astype(int))]
-    near = float(np.median([seen.unlike([(int(some[at]), int(beside[at]))], False) for at in chosen]))
+    near = float(np.median([seen.unlike([(int(some[at]), int(beside[at]))], False) for at in spread(chosen, PAIRS)]))
     for mirrored in (True, False) if source.cone is None else (False,):
         turn = _turn_seen(seen, views, some, degrees, near, mirrored)
         if turn is not None:
@@ -272,9 +272,12 @@ def _turn_seen(
     usual, (early, late) = float(np.median(differences)), ends[int(np.argmin(differences))]
     fixed, moved = (early, late) if early == first else (late, early)
     around = views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != fixed)]
-    best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in some_of(around, _AROUND).tolist())
+    best, nearest = min((seen.unlike([(fixed, row)], mirrored), row) for row in spread(around, _AROUND).tolist())
     turned = abs(float(degrees[nearest] - degrees[fixed]))
-    if abs(turned - period) <= max(OTHER * period, 2 * step) or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
+    right = max(OTHER * period, 2 * step)
+    apart = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
+    off = min([off, *np.array(differences)[np.abs(apart - period) <= right]])
+    if abs(turned - period) <= right or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
         return None
     return _Turn((min(fixed, nearest), max(fixed, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
@@ -286,8 +289,7 @@ def _stated_apart(
     partner = views[np.abs(degrees[views] - degrees[some][:, None] - period).argmin(axis=1)]
     step = min(float(np.median(np.diff(np.unique(degrees[views])))), float(np.ptp(degrees[some])) / (some.size - 1))
     pairs = np.flatnonzero(np.abs(degrees[partner] - degrees[some] - period) <= step)
-    pairs = pairs[np.unique(np.linspace(0, pairs.size - 1, PAIRS).astype(int))] if pairs.size else pairs
-    return [(int(some[at]), int(partner[at])) for at in pairs if seen.lit(int(partner[at]))]
+    return [(int(some[at]), int(partner[at])) for at in spread(pairs, PAIRS) if seen.lit(int(partner[at]))]
 
 
 def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:

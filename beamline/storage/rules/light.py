@@ -21,10 +21,10 @@ from beamline.storage.rules.references import (
     groups_taken,
     mean_cells,
     reference_groups,
-    some_of,
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32
+from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
 AT_THE_ENDS = 1e-3  # share of a view's pixels that its least and its largest number may have, where it was scaled
@@ -53,7 +53,7 @@ def views_scaled(source: ScanSource) -> Iterator[Finding]:
     if rows.size < VIEWS:
         return
     ends, places = set(), (set[int](), set[int]())
-    for row in some_of(rows, VIEWS).tolist():
+    for row in spread(rows, VIEWS).tolist():
         view = read_known(source, [row])[0]
         low, high = float(view.min()), float(view.max())
         ends.add((low, high))
@@ -136,7 +136,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         return
     light = float(np.percentile((flat - dark)[lit], BRIGHT))
     limit = max(LIT * light, BLOCK_SIGMAS * noise_of(dark))
-    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     under = [(dark - view)[lit] for view in cells_of(source, views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
@@ -156,7 +156,7 @@ def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
     """Sentences on possible causes of a factor between views and flats."""
-    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     flats = np.concatenate(groups.flats)
     seen, flat, dark = (mean_cells(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
     lit = lit_places(flat - dark)
@@ -200,8 +200,8 @@ def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
     """
     middle = source.shape[0] // 2
     rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
-    views = some_of(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
-    taken = [np.concatenate(groups.darks), some_of(max(groups.flats, key=len), VIEWS), views]
+    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    taken = [np.concatenate(groups.darks), spread(max(groups.flats, key=len), VIEWS), views]
     darks, flats, seen = (read_known(source, some, rows).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0

@@ -35,6 +35,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.exposures import levelled, usual_exposure, views_differ
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
+from recon.base.views import spread
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
@@ -127,7 +128,7 @@ def _judged(source: ScanSource, limits: ReferenceLimits | None) -> ReferenceGrou
             [group for group in lit if start <= group[0].row < end],
             exposed[(exposed >= start) & (exposed < end)],
         )
-        witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
+        witnesses = _readable(source, spread(seen, SAMPLES)) if seen.size and own else []
         groups_judged += judge([*dark, *own], limits, witnesses)[len(dark) :]
     alike, brighter = None, None
     if lit and not any(group.faults for group in groups_judged[len(dark) :]):
@@ -151,7 +152,7 @@ def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if not views.size:
         return []
-    chosen = set(some_of(views, VIEWS).tolist())
+    chosen = set(spread(views, VIEWS).tolist())
     for group in flats:
         at = int(np.searchsorted(views, group[0]))
         chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
@@ -209,11 +210,6 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
             yield Finding("warning", "bad-references", f"{message} The other {name} are used instead.")
 
 
-def some_of(group: Frames, most: int) -> Frames:
-    """At most so many rows, evenly spread."""
-    return group[np.unique(np.linspace(0, group.size - 1, min(most, group.size)).astype(int))]
-
-
 def _with_unread(source: ScanSource, judged: GroupVerdict, taken: Sequence[Frames]) -> GroupVerdict:
     """The group with frames of its own that the file does not give: who reads them leaves them out, and names them."""
     own = next(group for group in taken if judged.rows[0] in group)
@@ -256,7 +252,7 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
         return source.exposures
     dark, light = (mean_cells(source, rows) for rows in (darks, flats))
     lit = lit_places(light - dark)
-    seen = [mean_cells(source, row) for row in some_of(views, VIEWS)[:, None]]
+    seen = [mean_cells(source, row) for row in spread(views, VIEWS)[:, None]]
     shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
     most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
     of_views = source.exposures[views]

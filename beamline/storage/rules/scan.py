@@ -22,6 +22,7 @@ from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import exposures_agree, views_scaled
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
+from recon.base.views import spread
 
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
@@ -134,7 +135,7 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
     if source.emission is not None or source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
         return
-    depths = _depths(source, views[np.unique(np.linspace(0, views.size - 1, TURNED).astype(int))])
+    depths = _depths(source, spread(views, TURNED))
     if not depths.size:
         return
     ratio = change_of_rows(depths)
@@ -323,10 +324,10 @@ def _sample(source: ScanSource, kind: FrameKind, count: int = SAMPLES) -> NDArra
     rows = np.flatnonzero(source.image_key == kind)
     if rows.size == 0:
         return None
-    chosen = np.unique(np.linspace(0, rows.size - 1, count).astype(int))
+    rows = spread(rows, count)
     middle = source.shape[0] // 2
-    images = read_known(source, rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
-    known = ~np.isin(rows[chosen], sorted(source.unreadable))
+    images = read_known(source, rows, slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    known = ~np.isin(rows, sorted(source.unreadable))
     if not known.any():
         raise UnreadableError(next(iter(source.unreadable.values())))
     return images[known]

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from beamline.monitor.flats_with_sample import lit_places
 from beamline.monitor.references import BRIGHT, ReferenceFrame
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, reference_frame, some_of
+from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, reference_frame
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, median_deviation
+from recon.base.views import spread
 
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
 _SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
@@ -43,7 +44,7 @@ class ViewLight:
         if used is None:
             return cls(source, None, None, 1.0)
         dark, flat = (_mean_cells(source, groups) for groups in (used.darks, used.flats))
-        seen = [brightness(_cells(source, row), dark, flat) for row in some_of(views, VIEWS).tolist()]
+        seen = [brightness(_cells(source, row), dark, flat) for row in spread(views, VIEWS).tolist()]
         return cls(source, dark, flat, float(np.percentile(seen, BRIGHT)) if seen else 1.0)
 
     def suspect(self, data: NDArray[np.generic], dark: F32 | None, flat: F32 | None) -> NDArray[np.bool_]:

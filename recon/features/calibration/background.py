@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from recon.base.arrays import F32, F64, Mask, median_deviation
-from recon.base.binning import bin_views, factor_within
+from recon.base.arrays import F32, F64, Mask, bin_views, factor_within, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.views import spread
@@ -31,7 +30,7 @@ from recon.prep.background import LEAST_SIZE, coordinate, powers
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.voxel_problem import density_unit
 
@@ -189,7 +188,7 @@ class _Views:
         return self.select(seen), self.select(unseen)
 
     def less(self, coefficients: F64) -> F32:
-        """The data less the background."""
+        """The data minus the background."""
         return np.asarray(self.data - np.tensordot(coefficients.astype(np.float32), self.terms, 1))
 
     def without_volume(self, images: F32, inside: F32 | None = None) -> F64:
@@ -222,7 +221,7 @@ class _Views:
 
 
 class _Trial:
-    """A volume of views less some background."""
+    """A volume of the views minus a background."""
 
     def __init__(self, views: _Views, coefficients: F64, volume: Volume | None = None) -> None:
         self.views, self.coefficients, self.volume = views, coefficients, volume
@@ -236,13 +235,13 @@ class _Trial:
         return np.asarray(data - views.projector.forward(self.volume.data))
 
     def errors(self, unseen: _Views) -> F64:
-        """[view] mean square that volume and background leave of views held out."""
+        """[view] mean square residual of views held out, by volume and background."""
         assert self.volume is not None
         left = unseen.less(self.coefficients) - unseen.projector.forward(self.volume.data)
         return np.asarray(np.average(np.square(left, dtype=np.float64), axis=(1, 2), weights=unseen.weight))
 
     def beats(self, other: _Trial, unseen: _Views, share: float) -> bool:
-        """It leaves less than a share of what another leaves of views held out, and its background is large enough."""
+        """Whether its residual of views held out is below a share of another's, and its background large enough."""
         ours, theirs = self.errors(unseen), other.errors(unseen)
         change = np.tensordot(self.coefficients - other.coefficients, self.views.terms, 1)
         large = float(np.sqrt(np.mean(np.square(change)))) >= LEAST_SIZE

@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from functools import partial
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.declared_types import Bound, Checked, Count, NonNegative, check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.base.work import Costs, Work
-from recon.features.joint.energy_fit import EnergyViews
-from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS
-from recon.features.joint.series import SWEEPS, TimedViews, fit_series, series_costs
-from recon.features.joint.share_fit import STEPS, fit_share
+from recon.base.work import Costs, SizedRun, Work
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews
+from recon.features.joint.motion import Motion
+from recon.features.joint.proportions import SOLUTION_STEPS, STEPS, TRIAL_STEPS, fit_share
+from recon.features.joint.series import MOMENTS, SWEEPS, TimedViews, fit_series, of_moments, series_costs
 from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
@@ -27,7 +28,7 @@ _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned vi
 
 
 @dataclass(frozen=True)
-class TimeSeries:
+class TimeSeries(Checked):
     """Volumes at even times of one scan of a sample that changes, see `fit_series`.
 
     Attributes:
@@ -44,13 +45,10 @@ class TimeSeries:
     label: ClassVar[str] = "Volumes in time"
     traits: ClassVar[Traits] = Traits(in_time=True)
 
-    volumes: int = 2
+    volumes: Annotated[int, Bound(2)] = 2
     moves: bool | None = None
-    sweeps: int = SWEEPS
-    weight: float | None = None
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"volumes": 2, "sweeps": 1}, least={"weight": 0.0})
+    sweeps: Count = SWEEPS
+    weight: NonNegative | None = None
 
     @property
     def volume_names(self) -> tuple[str, ...]:
@@ -112,11 +110,11 @@ class EnergySeries:
 
     materials: tuple[str, ...] = ("matter",)
     states: tuple[str, ...] = ()
-    sweeps: int = MATERIAL_SWEEPS
-    weight: float | None = None
+    sweeps: Count = MATERIAL_SWEEPS
+    weight: NonNegative | None = None
 
     def __post_init__(self) -> None:
-        check_settings(self, whole={"sweeps": 1}, least={"weight": 0.0})
+        check_settings(self)
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "states", tuple(self.states))
         if not self.materials or len(set(self.materials)) < len(self.materials):
@@ -209,41 +207,34 @@ class _History:
         self.began = self.control.now()
 
     def heard(self, sweep: int, residual: float) -> bool:
-        """As `fit_series` and `fit_materials` call their `go_on`."""
+        """The `go_on` of `fit_series` and `fit_materials`."""
         if sweep > 0:
             self.tell(sweep, residual)
         else:
             self.tried += 1
-            self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
+            self.control.tell_part(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
             self.tried = 0 if sweep == 0 else self.tried
         return not self.control.stop()
 
     def heard_share(self, steps_to_come: int) -> bool:
-        """As `fit_share` calls its `go_on`."""
-        self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
+        """The `go_on` of `fit_share`."""
+        self.control.tell_part(STEPS - steps_to_come, STEPS, self.began, self.n_views, "steps of the share")
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
-        """Of a sweep of the fit."""
-        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
-
-    def _tell(self, reached: Progress) -> Progress:
-        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        if self.control.on_progress is not None:
-            self.control.on_progress(now)
-        return now
+        """Record and report a sweep of the fit."""
+        seconds = self.control.now() - self.began
+        reached = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
+        self.of_sweeps = (*self.of_sweeps, reached)
+        self.control.tell(reached)
 
     def result(
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
     ) -> Reconstruction:
-        """The volumes with this history."""
+        """The reconstruction with this history."""
         if not self.of_sweeps:  # it was stopped before
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
-
-
-def _progress(n: int, of: int, unit: str) -> Progress:
-    return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
 
 
 def _require_own_grid(problem: ReconProblem) -> None:
@@ -252,7 +243,7 @@ def _require_own_grid(problem: ReconProblem) -> None:
 
 
 def _bytes_of(geometry: Geometry) -> int:
-    """Of all line integrals."""
+    """Bytes of all line integrals."""
     return 4 * geometry.n_views * math.prod(geometry.detector_shape)
 
 
@@ -273,8 +264,33 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
-    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
     judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"
     return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+
+
+def timed(which: str) -> tuple[SizedRun, ...]:
+    """Sweeps of so many volumes, as of "moving 3"."""
+    from recon.machine_speed import views_of_disc
+
+    kind, count = which.split()
+    volumes, sized = int(count), list[SizedRun]()
+    for cols in (32, 80):
+        geometry, grid, data = views_of_disc("parallel", 16, cols, 12 * volumes)
+        n, motion = geometry.n_views, None
+        if kind == "energies":
+            views = EnergyViews(data, geometry, np.arange(n) * volumes // n, np.eye(volumes) + 0.5)
+        else:
+            times, (nz, ny, nx) = np.arange(n, dtype=np.float64), grid.shape
+            knots = np.linspace(0, times[-1], volumes)
+            views, past = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
+            motion = Motion.none((ny, nx, nz), past, 3, 3) if kind == "moving" else None
+        fit = EnergyFit(views, grid, np.random.default_rng(0), motion)
+        sized.append(SizedRun(n, n * math.prod(grid.shape), partial(_sweep, fit, volumes)))
+    return tuple(sized)
+
+
+def _sweep(fit: EnergyFit, volumes: int) -> None:
+    list(fit.sweeps(np.full(volumes, 0.1), 1))

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
-from recon.base.declared_types import check_arguments
+from recon.base.declared_types import check_arguments, check_settings
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
-from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 from recon.features.joint.learnt_motion import (
     JUDGED,
     JUDGED_SWEEPS,
@@ -34,7 +33,7 @@ from recon.features.joint.learnt_motion import (
 from recon.features.joint.motion import Motion, moved
 from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.features.joint.spectral import weight_of, weights_by_views
-from recon.voxels.held_out import beyond_chance, busiest_rows, slab_of
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
@@ -203,7 +202,7 @@ def _motion(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> tuple[Motion | None, tuple[float, float] | None]:
-    """How the sample moves, and what volumes without and with motion leave of views held out, where these chose."""
+    """The motion of the sample, and residuals of views held out without and with motion, where these chose."""
     unseen = None
     if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
         wanted = _moves(*squares)
@@ -213,7 +212,7 @@ def _motion(
 
 
 def _moves(still: F64, moved: F64) -> bool:
-    """By squares [block] that volumes without and with motion leave of views held out."""
+    """Whether matter moves, by squared residuals [block] of views held out without and with motion."""
     return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
@@ -248,14 +247,11 @@ def smooth_factors(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> float | None:
-    """How smooth factors of the mean are best; None: volumes by themselves predict views held out as well.
+    """The best smoothness of factors of the mean; None: separate volumes predict views held out as well.
 
     Of some rows, from seven of eight views.
     """
-    rows, n_rows = slice(None), views.geometry.detector_shape[0]
-    if views.geometry.rows_show_slices:
-        rows = busiest_rows(views.projections, _ROWS)
-        grid = slab_of(views.geometry, grid, *rows.indices(n_rows)[:2])[1]
+    rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
     going = True

@@ -18,8 +18,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.empirical import ONE_IN
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.voxels.held_out import busiest_rows, slab_of
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 
 TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray
@@ -136,13 +135,13 @@ class _Trials:
         go_on: Callable[[int, float], bool],
         stop: Callable[[], bool],
     ) -> None:
-        """`fit` has the views of a trial, `judge` those held out."""
+        """Take the views of a trial (`fit`) and those held out (`judge`)."""
         self.going = True
         self._fit, self._judge, self._sweeps = fit, judge, sweeps
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """What a trial leaves of the views held out, infinite if it was ended; `after` it so many may follow."""
+        """Residual of the views held out, infinite if the trial was ended; `after` it so many trials may follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
@@ -168,7 +167,7 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """Of these weights times powers of the factor, the heaviest that predict as well; `weights` if ended."""
+        """The heaviest weights, times powers of the factor, that predict as well; `weights` if ended."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:
@@ -195,10 +194,7 @@ def weights_by_views(
         alike: all components keep one weight.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
-    rows = slice(None)
-    if views.geometry.rows_show_slices:
-        rows = busiest_rows(views.projections, TRIAL_ROWS)
-        grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
+    rows, grid = trial_rows(views, grid, TRIAL_ROWS)
     fit, judge = (
         EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop=stop)
         for chosen in (~held_out, held_out)

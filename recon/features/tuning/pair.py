@@ -16,7 +16,7 @@ from scipy.ndimage import rotate
 
 from recon.base.arrays import F64
 from recon.prep.align import AxisError, axis_from_pair
-from recon.prep.axis_search import FEWEST_BANDS
+from recon.prep.axis_wedge import FEWEST_BANDS
 
 BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8
@@ -27,7 +27,7 @@ OUTLIER = 4.0  # Median distances from the line beyond which a band does not cou
 
 @dataclass(frozen=True)
 class PairAlignment:
-    """Where the rotation axis is.
+    """Position and tilt of the rotation axis.
 
     Attributes:
         axis_col: its column at the middle row, 0 at the centre of the first column.

@@ -23,7 +23,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
-from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
+from recon.assess.time_model import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
@@ -31,12 +31,12 @@ from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -66,13 +66,13 @@ def _as_fast_as(monkeypatch: pytest.MonkeyPatch, *speeds: float) -> None:
     monkeypatch.setattr(module, "speeds_of", lambda *_: Speeds(*speeds))
 
 
-@pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
+@pytest.mark.parametrize("budget", others_slow([5.0, 8.0, 12.0], 2))
 def test_the_time_is_used_and_not_exceeded(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
+    monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
     done = _spend(prepared, budget, SteppedClock(100.0, 0.01))
     assert done.settings["chosen_method"] == "r2"
     assert 0.9 * budget < done.seconds <= budget
@@ -108,6 +108,7 @@ def test_a_slow_machine_takes_fbp_of_binned_pixels(
     assert "binned 2 x 2" in done.chosen and done.chosen.startswith("fbp")
 
 
+@pytest.mark.slow
 def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,7 +136,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
 ) -> None:
     """More steps than were best on other scans follow the noise."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))
+    monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))
     monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, SteppedClock(100.0, 0.1), methods=(R2(),))
     assert done.history[-1].step == 7 and done.seconds < 30
@@ -257,6 +258,7 @@ def _cone(
     )
 
 
+@pytest.mark.slow
 def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections) -> None:
     """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
     cone = _cone(prepared, 2 * np.pi)
@@ -312,6 +314,7 @@ def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) 
     assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
 
 
+@pytest.mark.slow
 def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
@@ -336,6 +339,7 @@ def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert done["chosen"] in page and done["next_db_said"] in page
 
 
+@pytest.mark.slow
 def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     options = ReconOptions(

@@ -14,8 +14,7 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
-from recon.base.slabs import part_of, slabs_of
-from recon.base.volume import Grid
+from recon.base.volume import Grid, part_of, slabs_of
 from recon.voxels.projector import Projector, seen_rays
 
 
@@ -81,6 +80,7 @@ def test_slabs_that_follow_fit_together(method: Method, rng: np.random.Generator
     assert np.abs(found - whole).max() < (1e-3 if method.traits.halo else 1e-6) * whole.max()
 
 
+@pytest.mark.slow
 def test_fits_of_slabs_fit_together_within_the_noise() -> None:
     """Slabs differ from a fit of all rows by less than fits of two scans do by their noise, also at their edge."""
     geometry = Geometry.parallel(np.arange(40) * np.pi / 40, (48, 40))

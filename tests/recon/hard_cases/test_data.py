@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.kernel import Truncation
 from recon.base.method import DataUse
-from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.prep.correct import References, correct
 from recon.reconstruction import Reconstruction, reconstruct
@@ -27,6 +27,7 @@ from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
 from tests.recon.hard_cases import spheres
 from tests.recon.helpers import run_steps
+from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 SHAPE = (12, 48)
@@ -151,7 +152,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without).volume.data
 
 
-@pytest.mark.parametrize("value", [1e30, -1e30, 1e9, 3e3, 300.0])
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
@@ -233,13 +234,13 @@ def test_a_fit_takes_angles_in_any_order_and_range(clean: F32, truth: F32) -> No
     rng = np.random.default_rng(4)
     order = rng.permutation(32)
     odd = Geometry.parallel(VIEWS.angles[order] + 2 * math.pi * rng.integers(-9, 10, 32), SHAPE)
-    # The views that a step draws differ, too, and those held out, where a turn rounds an angle of 0 to one below a half
-    # turn: over seeds a fit's PSNR scatters by 0.25 dB, a difference of two means of 24 by 0.07.
+    # A step draws other views: over seeds a fit's PSNR scatters by 0.2 dB, the mean of eight by 0.07. What depends on
+    # the order itself is the weight of total variation, by the views that tell of noise, which these data do not have.
     plain, mixed = (
-        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(24)])
+        np.mean([psnr(truth, fitted(data, views, seed=seed).volume.data) for seed in range(8)])
         for data, views in ((clean, VIEWS), (clean[order], odd))
     )
-    assert abs(plain - mixed) < 0.5
+    assert abs(plain - mixed) < 0.3
 
 
 @pytest.mark.parametrize("shape", [(1, 48), (12, 1), (1, 1), (2, 17), (1, 300)])

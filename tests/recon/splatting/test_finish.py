@@ -25,8 +25,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -134,6 +133,7 @@ def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     assert filled < direct < 0.6 < 0.8 < opened
 
 
+@pytest.mark.slow
 def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generator) -> None:
     # All views see the corners of the box cut off: the fit explains them by matter beyond the box, and there is none.
     views = Geometry.parallel(np.linspace(0, math.pi, 40, endpoint=False), (12, 32))

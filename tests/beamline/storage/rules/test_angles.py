@@ -150,3 +150,15 @@ def test_neighbours_that_are_mirror_images_are_named(
 ) -> None:
     (hit,) = ordered(scan(balls, true, stated))
     assert hit.severity == "warning" and "are mirror images" in hit.message
+
+
+@pytest.mark.parametrize("views", [53, 67, 74, 89, 107])
+def test_any_number_of_views_shows_halves_exchanged_and_no_symmetric_sample(views: int) -> None:
+    even = turn(180, views)
+    for balls in (WITHIN, WIDER):
+        (hit,) = ordered(scan(balls, np.roll(even, views // 2), even))
+        assert "are mirror images" in hit.message
+    copied = even.copy()
+    copied[views // 2 : views // 2 + 2] = even[views // 2 - 1]
+    for balls in (ROD, [(0, 0, 22, 0.01), (9, 5, 6, 0.04)]):
+        assert ordered(scan(balls, copied, even)) == []

@@ -1,0 +1,171 @@
+"""The views of a scan: which may be used, and their geometry as stated and with what corrections find out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.phases import Phases
+from beamline.core.sinks import Note, Warn
+from beamline.projections.corrections.poses import poses_of, stated_poses
+from beamline.projections.corrections.preparation import Preparation
+from beamline.projections.protocols import GeometryLearnt, PlaceStep, RayStep, ViewMotion
+from beamline.projections.registry import geometry_steps, in_order
+from beamline.projections.replay import judged_flags
+from beamline.projections.selection import Selection, choose_views, geometry_of
+from beamline.projections.step import StepDone
+from beamline.projections.usable_views import UsableViews, usable_views
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules import angle_order
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.light import darks_beside_views
+from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
+from beamline.storage.rules.treatment import frames_flagged
+from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+
+
+def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
+    """The views that the selection names, as scan and options state them, before any frame is read.
+
+    An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+        DataError: the poses do not fit the scan.
+    """
+    frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    poses = poses_of(source, selection, frames)
+    if poses is not None:
+        frames = frames[poses.stated(frames)]
+    frames = frames[choose_views(source, frames, selection)]
+    stated = source.axis_col if selection.axis_col is None else selection.axis_col
+    axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
+    geometry = geometry_of(source, selection, axis_col, source.angles[frames])
+    if poses is not None:
+        geometry = poses.corrected(geometry, frames)
+    return with_rays(source, selection, geometry)[0]
+
+
+def with_rays(source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, dict[str, StepDone]]:
+    """The geometry of views after every `RayStep`, and what these steps did, by name.
+
+    Raises:
+        ConfigError: a step does not fit the scan.
+    """
+    done = dict[str, StepDone]()
+    for step in in_order(selection):
+        if isinstance(step, RayStep):
+            geometry, done[step.name] = step.rays(source, selection, geometry)
+    return geometry, done
+
+
+@dataclass(eq=False)
+class ViewGeometry:
+    """The geometry of views: the stated angles, and what steps find out and change.
+
+    Attributes:
+        stated_axis: the column of the rotation axis before calibration.
+        moved: where the sample was in the views, by the name of the step that found it.
+        rays: what the steps on rays did, by name.
+        learnt: what was learnt of the geometry, by the name of the step.
+    """
+
+    source: ScanSource
+    selection: Selection
+    stated_axis: float
+    moved: dict[str, ViewMotion] = field(default_factory=dict)
+    rays: dict[str, StepDone] = field(default_factory=dict)
+    learnt: dict[str, GeometryLearnt] = field(default_factory=dict)
+
+    @property
+    def axis_col(self) -> float:
+        """The column of the rotation axis."""
+        return self.stated_axis + sum(learnt.axis for learnt in self.learnt.values())
+
+    @property
+    def done(self) -> dict[str, StepDone]:
+        """What the steps did, by their names."""
+        calibrated = {name: learnt.done for name, learnt in self.learnt.items()}
+        return {**{name: motion.done for name, motion in self.moved.items()}, **self.rays, **calibrated}
+
+    def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
+        """Let each step find where the sample was; those of the `usable` views that can still be used."""
+        for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
+            motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
+            self.moved[step.name] = motion
+            if motion.done.sentence:
+                warn(motion.done.sentence)
+            usable = usable.only(motion.frames)
+        return usable
+
+    def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
+        """Learn the geometry from these views, where that is asked for."""
+        for step in geometry_steps(self.selection):
+            if step.geometry:
+                phases.enter("calibration", "steps")
+                learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+                self.learnt[step.name] = learnt
+
+    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views, before calibration."""
+        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
+        for motion in self.moved.values():
+            geometry = motion.corrected(geometry, view_ids)
+        geometry, self.rays = with_rays(self.source, part, geometry)
+        return geometry
+
+    def of(self, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views."""
+        geometry = self.uncalibrated(self.selection, view_ids)
+        for learnt in self.learnt.values():
+            geometry = learnt.corrected(geometry, view_ids)
+        return geometry
+
+
+_OF_A_CIRCLE = angle_order.RULE, "axis"  # rules on what vectors of each view take the place of
+
+
+def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+    """The views of a finished scan that may be used, by the flags of the monitor.
+
+    Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
+
+    Raises:
+        DataError: it cannot be reconstructed; with every reason, and what to do about each.
+    """
+    asked = selection.step(Preparation)
+    judged = judged_flags(source) if asked.judged and source.finished else None
+    findings = [*scan_findings(source), *scan_ended(source)]
+    findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
+    if asked.uses_flags:
+        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
+    if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:
+        findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
+    refuse(source, findings)
+    usable = usable_views(source, asked.uses_flags, judged)
+    if usable.sentence:
+        warn(Note(usable.sentence))
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
+    return usable
+
+
+def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
+    """Raises DataError for the errors among the findings, with what to do about each."""
+    reasons = [finding.message for finding in findings if finding.severity == "error"]
+    if reasons:
+        raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
+
+
+def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
+    """Why the frames of a scan that is still growing cannot be corrected."""
+    checked = () if selection.step(Preparation).accepted else (references_usable,)
+    rules = (quantity_stated, references_present, *checked)
+    return [finding for rule in rules for finding in rule(source)]

@@ -1,0 +1,154 @@
+"""Sheets of images in one grey window: a slice of many volumes, flagged frames with their reasons, darks and flats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.report.figures import (
+    WIDTH,
+    GreyWindow,
+    bright_centre,
+    dpi_for,
+    grey_window,
+    new_figure,
+    panels,
+    png,
+    show_grey,
+)
+from recon.base.arrays import F32
+from recon.base.greys import matter_window
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+
+_COLUMNS = 4
+
+
+class SliceSheet:
+    """The slice [y, x] of each volume through the bright parts of the first one, by label.
+
+    `down`: name of the axis that goes down, of volumes that are turned.
+    """
+
+    def __init__(self, down: str = "y") -> None:
+        self._at, self._down = 0, down
+        self._shown: dict[str, F32] = {}
+        self._drawn: set[tuple[str, str]] = set()
+
+    def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
+        """Adds a slice of the volume; of each family and method, only the first volume counts."""
+        if family and (family, method) in self._drawn:
+            return
+        if not self._shown:
+            self._at = bright_centre(volume)[0]
+        self._drawn.add((family, method))
+        self._shown[label] = volume[self._at].copy()
+
+    def labels(self, method: str = "") -> list[str]:
+        """The labels of slices that belong to no row, then those of a method ("": none)."""
+        return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
+
+    def png(self, labels: Sequence[str]) -> bytes:
+        """These slices, four beside one another, in the grey window of the first."""
+        low, high = matter_window(self._shown[labels[0]])
+        rows, cols = self._shown[labels[0]].shape
+        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
+        # One image: a panel for each slice takes ten times as long to draw.
+        sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
+        size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
+        figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        for i, label in enumerate(labels):
+            top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
+            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label]
+            axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
+        axes.text(0.02 * cols, head + 0.95 * rows, f"x → {self._down} ↓", fontsize=6, color="tab:orange")
+        axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
+        return png(figure)
+
+
+COLUMNS = 4
+_COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
+
+
+@dataclass(frozen=True, eq=False)
+class FlaggedFrame:
+    """A frame for the sheet.
+
+    Attributes:
+        image: [row, col] counts, binned where there are many.
+        extent: (rows, cols) of the whole frame, in pixels of the detector.
+        reasons: a line for each flag.
+        regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
+            the last.
+    """
+
+    image: NDArray[np.float32]
+    extent: tuple[int, int]
+    title: str
+    reasons: Sequence[str]
+    regions: Sequence[tuple[int, int, int, int]]
+    alarm: bool
+
+
+def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
+    """The frames as PNG, row 0 at the top, in one grey window, with a box around each region."""
+    from matplotlib.patches import Rectangle
+
+    down = -(-len(frames) // COLUMNS)
+    lines = max(len(frame.reasons) for frame in frames)
+    rows, cols = frames[0].extent
+    width = WIDTH / COLUMNS
+    height = np.clip(width * rows / cols, 0.5, 3.0) + 0.25 + 0.13 * lines
+    figure = new_figure((WIDTH, float(height) * down))
+    window = grey_window([frame.image for frame in frames], 0.5, 99.5)
+    panels = np.ravel(figure.subplots(down, COLUMNS, squeeze=False))
+    for axes in panels[len(frames) :]:
+        axes.set_axis_off()
+    for axes, frame in zip(panels, frames, strict=False):
+        _show(axes, frame.image, window, frame.extent)
+        colour = _COLOURS[frame.alarm]
+        for top, bottom, left, right in frame.regions:
+            box = Rectangle((left - 0.5, top - 0.5), right - left, bottom - top, fill=False, ec=colour, lw=1.2)
+            axes.add_patch(box)
+        for side in axes.spines.values():
+            side.set(color=colour, linewidth=1.5)
+        axes.tick_params(labelsize=5, length=2)
+        axes.set_title("\n".join([frame.title, *frame.reasons]), fontsize=6.5)
+    return png(figure)
+
+
+def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int, int]) -> bytes:
+    """Mean darks and flats as PNG, row 0 at the top, each in a grey window of its own with its scale.
+
+    Args:
+        images: [row, col] by title, counts or ratios, binned where they are large.
+        shape: (rows, cols) of the detector.
+    """
+    rows, cols = shape
+    width = WIDTH / max(len(images), 2) - 1.3
+    high = float(np.clip(0.85 * width * rows / cols, 0.6, 4.0))
+    figure, (row,) = panels([width] * len(images), [high], gap=1.3, right=0.5)
+    for axes, (title, image) in zip(row, images.items(), strict=True):
+        shown = _show(axes, image, grey_window([image], 0.5, 99.5), shape)
+        axes.tick_params(labelsize=6)
+        axes.set_title(title, fontsize=8)
+        axes.set_xlabel("column", fontsize=7)
+        axes.set_ylabel("← row", fontsize=7)
+        figure.colorbar(shown, ax=axes, fraction=0.05, pad=0.02).ax.tick_params(labelsize=6)
+    return png(figure)
+
+
+def _show(axes: Axes, image: NDArray[np.float32], window: GreyWindow, shape: tuple[int, int]) -> AxesImage:
+    """Draw an image of the whole detector of so many rows and columns, in its pixels."""
+    rows, cols = shape
+    edges = -0.5, cols - 0.5, rows - 0.5, -0.5
+    return show_grey(axes, image, window, edges, stretched=rows < 0.15 * cols)
