@@ -26,7 +26,7 @@ from beamline.core.files import TEXT, decoded
 from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.images.image_names import NamedImages, in_order
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
@@ -49,7 +49,7 @@ class TiffSeriesSource(ScanSource):
         """Open. `one_series`: all images are one numbered series, whatever the names say of kinds."""
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
-        try:
+        with hdf5.closed_on_error(self):
             names = self._names()
             images = in_order(path, [name for name in names if name.lower().endswith(SUFFIXES)], one_series=one_series)
             self._files, self.image_key, self.angles = images.names, images.kinds, images.angles
@@ -63,21 +63,11 @@ class TiffSeriesSource(ScanSource):
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
-        except BaseException:
-            self.close()
-            raise
-        self._missing, gaps = _left_out(images)
+        missing, gaps = _left_out(images)
+        self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return offered(self)
-
-    @property
-    def ending(self) -> ScanEnding:
-        return ScanEnding(missing=self._missing)
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
