@@ -8,9 +8,12 @@ in one line time, so row r starts r / 2 line times after row 0.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
+
+import numpy as np
 
 from drivers.base.protocols import CameraSettings, CameraTiming
 from drivers.flat import MEGABYTES, Declared, key
@@ -33,6 +36,63 @@ FRAME_OVERHEAD_LINES = 5
 """Line times between two frames: with the 1152 lines of a frame they give the standard mode's 120 frames/s."""
 LINK_BYTES_PER_S = MappingProxyType({"usb3": 4096 * 2304 * 2 * 17.6996, "coaxpress": 4096 * 2304 * 2 * 120.04})
 """Computed from the full-frame 16-bit frame rates of the two interfaces."""
+
+QE_NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
+QE = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.40, 0.33, 0.30, 0.20, 0.09)
+"""Quantum efficiency of ORCA-Quest 2 at QE_NM, off the catalogue's figure: 600 to 800 nm may be 0.1 to 0.15 too low."""
+
+
+def quantum_efficiency(wavelength_nm: float) -> float:
+    """Photoelectrons a photon of light, linear between the points of the curve."""
+    return float(np.interp(wavelength_nm, QE_NM, QE))
+
+
+@dataclass(frozen=True)
+class LightPath:
+    """From X-ray photons to photoelectrons: the screen, the lenses and mirror behind it, and the sensor.
+
+    Attributes:
+        absorbed: share of the X-ray photons that the screen stops.
+        light: photons of light that one of these makes: its keV times the screen's yield.
+        aperture: numerical aperture of the objective on the side of the screen.
+        index: of refraction of the screen.
+        transmission: of lenses, mirror and windows together.
+        wavelength_nm: of the light.
+    """
+
+    absorbed: float
+    light: float
+    aperture: float
+    index: float = 1.84
+    transmission: float = 0.9
+    wavelength_nm: float = 535.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("absorbed", 1e-6, 1.0), ("light", 1e-3, 1e6), ("aperture", 1e-3, 0.999), ("index", 1.0, 4.0),
+            ("transmission", 1e-6, 1.0), ("wavelength_nm", QE_NM[0], QE_NM[-1]),
+        ):  # fmt: skip
+            if not low <= (value := getattr(self, name)) <= high:
+                raise ValueError(f"{name} lies in {low:g} ... {high:g}, got {value:g}")
+
+    @property
+    def collected(self) -> float:
+        """Share of the light that the objective takes: a cone out of the screen, on one side."""
+        return (1 - math.sqrt(1 - (self.aperture / self.index) ** 2)) / 2
+
+    @property
+    def electrons(self) -> float:
+        """Photoelectrons of an X-ray photon that the screen stops."""
+        return self.light * self.collected * self.transmission * quantum_efficiency(self.wavelength_nm)
+
+    def x_rays_per_count(self, gain: float) -> float:
+        """X-ray photons at the screen that make a count.
+
+        Args:
+            gain: counts of a photoelectron as photon transfer finds it. Of `electrons` that come together, the variance
+                is 1 + electrons times that of single ones.
+        """
+        return (1 + self.electrons) / (gain * self.absorbed * self.electrons)
 
 
 def refusal(settings: CameraSettings, model: str = MODEL) -> str:

@@ -13,6 +13,7 @@ from beamline.config.monitor import MonitorSection, ReferencesSection
 from beamline.config.section import Section
 from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
+from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, names_of_one_volume, streams
 
@@ -136,6 +137,8 @@ class OpticsSection(Section):
     """Sample to detector."""
     axis_col: Column | None = None
     """Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."""
+    light_path: LightPath | None = None
+    """From X-ray photons to photoelectrons, for `beamline tune`; null: not known."""
 
 
 class StorageSection(Section):

@@ -166,18 +166,24 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     """Raises ConfigError for a cone's scan that its file could not describe, and that could not be reconstructed."""
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
-    row0, col0, rows, _ = camera.roi or (0, 0, height, width)
+    row0, _, rows, _ = camera.roi or (0, 0, height, width)
     if 2 * row0 + rows != height:
         raise ConfigError(
             f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
             f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
         )
     if config.optics.axis_col is None:
-        axis_col = ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
         raise ConfigError(
             "optics.axis_col: the scene is a cone beam, whose axis is not searched while views come; set it, here "
-            f"{axis_col:g}. Nothing was started."
+            f"{axis_col_of(config, scene):g}. Nothing was started."
         )
+
+
+def axis_col_of(config: Config, scene: Scene) -> float:
+    """Column of the frame that shows the scene's rotation axis."""
+    camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
+    _, col0, _, _ = camera.roi or (0, 0, height, width)
+    return ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
 
 
 def _cone(scene: Scene) -> tuple[float, float] | None:

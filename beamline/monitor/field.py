@@ -30,9 +30,11 @@ NAMED = 4  # most shadows that are named
 
 @dataclass(frozen=True)
 class FieldState:
-    """Unlit flats were reported; views in a row with matter at the edges; that was reported."""
+    """Unlit flats were reported; a view had all matter inside; views in a row with matter at the edges; that was
+    reported."""
 
     unlit: bool = False
+    inside: bool = False
     cut: int = 0
     reported: bool = False
 
@@ -70,8 +72,8 @@ class FieldOfViewCheck(Logged):
         edges = at_edges(context)
         cut = state.cut + 1 if max(edges) > self.edge else 0
         if cut < LASTS:
-            return Look(replace(state, cut=cut))
-        return Look(replace(state, reported=True), self._cut(frame.index, edges, context.grid))
+            return Look(replace(state, cut=cut, inside=state.inside or cut == 0))
+        return Look(replace(state, reported=True), self._cut(frame.index, edges, context.grid, state.inside))
 
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
@@ -98,12 +100,15 @@ class FieldOfViewCheck(Logged):
         )
         return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
-    def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid) -> Flag:
+    def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid, entered: bool) -> Flag:
         left, right = edges
         cut = {side: depth for side, depth in (("left", left), ("right", right)) if depth > self.edge}
+        beside = " It was inside before, so that it stands beside the rotation axis: centre it." * (
+            entered and len(cut) == 1
+        )
         advice = (
-            f"{beyond_the_field(cut)} The total absorption says nothing, floaters must be faster to be seen, and "
-            "reconstructions are brighter at the rim."
+            f"{beyond_the_field(cut)}{beside} The total absorption says nothing, floaters must be faster to be seen, "
+            "and reconstructions are brighter at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)

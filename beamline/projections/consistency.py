@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,7 +95,8 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     if not whole or few or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
-    if FieldEdges.of(data, geometry).beyond() or _air_is_off(data, some):
+    edges = FieldEdges.of(data, geometry)
+    if edges.beyond() or edges.passing() or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
         return _reported(laws, warn)
@@ -316,6 +317,17 @@ def _axis(shown: ViewMoments, used: float, selection: Selection) -> Law:
     )
     off = abs(shown.axis_col - used) if selection.axis_col is not None else np.nan
     return Law("axis of the centres of mass", off, max(_AXES_AGREE, _SURE * shown.axis_sigma), "columns", sentence)
+
+
+def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
+    """A warning for `FieldEdges.passing`."""
+    words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
+    return (
+        f"Matter leaves the field {words} of {n_views}, and all of it is inside in others: the sample, or a part of "
+        "it, stands beside the rotation axis. What lies farther from the axis than the edge is not reconstructed, and "
+        "the rim is uncertain. Centre the sample on the axis, or move the camera until the axis is near its edge and "
+        "take a full turn."
+    )
 
 
 def cut_sentence(sides: dict[str, float]) -> str:

@@ -15,7 +15,7 @@ from beamline.core.phases import Phases
 from beamline.core.plausible import RANGES, doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.consistency import compare_with_flats, cut_sentence, warn_of_inconsistency
+from beamline.projections.consistency import compare_with_flats, cut_sentence, passing_sentence, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.references import uncorrected_current
@@ -283,10 +283,13 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    if sides := FieldEdges.of(projections.data, geometry).beyond():
+    edges = FieldEdges.of(projections.data, geometry)
+    if sides := edges.beyond():
         warn(cut_sentence(sides))
         if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
             warn(change)
+    elif ranges := edges.passing():
+        warn(passing_sentence(ranges, geometry.n_views))
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")

@@ -31,6 +31,7 @@ class KindStatistics:
         percentiles: at PERCENT, to a count, or to 1/65536 of the range of real numbers.
         saturated: share of pixels at the greatest number of the pixels' type; 0 of real numbers.
         not_finite: share of pixels.
+        absolute: sum of the absolute values of a frame, mean over frames.
         edges, pixels: the histogram.
     """
 
@@ -46,6 +47,7 @@ class KindStatistics:
     not_finite: float
     edges: NDArray[np.float64]
     pixels: NDArray[np.int64]
+    absolute: float = 0.0
 
 
 def statistics_of(
@@ -90,7 +92,7 @@ def _of_kind(
     edges = (
         np.arange(low - 0.5, high + 1) if whole_numbers else np.linspace(low, high if high > low else low + 1, _BINS)
     )
-    pixels, total, squares = np.zeros(edges.size - 1, np.int64), 0.0, 0.0
+    pixels, total, squares, absolute = np.zeros(edges.size - 1, np.int64), 0.0, 0.0, 0.0
     for row in map(int, rows):
         good = image(row)
         good = good[np.isfinite(good)]
@@ -100,6 +102,7 @@ def _of_kind(
         else:
             pixels += np.histogram(good, edges)[0]
         total, squares = total + float(away.sum()), squares + float(away @ away)
+        absolute += float(np.abs(away + low).sum()) / rows.size
     mean = total / finite
     below = np.cumsum(pixels)
     at = np.searchsorted(below, np.array(PERCENT) / 100 * finite)
@@ -108,7 +111,7 @@ def _of_kind(
     return KindStatistics(
         kind, rows.size, of, low, high, low + mean, float(np.sqrt(max(squares / finite - mean**2, 0.0))),
         tuple(float(middles[i]) for i in at), float(pixels[-1] / finite) if high == full else 0.0, 1 - finite / whole,
-        edges, pixels,
+        edges, pixels, absolute,
     )  # fmt: skip
 
 
@@ -225,12 +228,12 @@ def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
 def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
     """The statistics as a table of texts: a head, and a row for each kind."""
     percent = tuple(f"{p:g} %" for p in PERCENT)
-    head = ("kind", "frames", "min", *percent, "max", "mean", "std", "saturated", "not finite")
+    head = ("kind", "frames", "min", *percent, "max", "mean", "std", "sum |v|", "saturated", "no data")
     rows = [
         (
             each.kind.name.lower(), f"{each.frames} of {each.of}",
             *(f"{v:.6g}" for v in (each.minimum, *each.percentiles, each.maximum, each.mean, each.deviation)),
-            f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.2g} %",
+            f"{each.absolute:.6g}", f"{100 * each.saturated:.2g} %", f"{100 * each.not_finite:.2g} %",
         )
         for each in statistics
     ]  # fmt: skip

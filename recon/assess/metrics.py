@@ -285,7 +285,8 @@ def contrast(truth: Array, volume: Array) -> dict[str, float]:
 
     `recovery`: (hot / body - 1) / (true hot / body - 1), mean of hot voxels. `spillover`: cold / body, of cold regions
     inside the body. `variation`: standard deviation over mean of the body, whose level most voxels of the truth have.
-    What the truth has no region for is left out.
+    `signal_to_background`: hot / body; `sbr_error`: relative, of the hot region farthest from the truth's.
+    `rmse`: of all voxels. What the truth has no region for is left out.
     """
     level = float(np.median(truth[truth > 0])) if (truth > 0).any() else 0.0
     if not level > 0:
@@ -301,9 +302,16 @@ def contrast(truth: Array, volume: Array) -> dict[str, float]:
     mean = float(volume[body].mean()) if body.any() else 0.0
     if not mean > 0:
         return {}
-    figures = {"variation": float(volume[body].std()) / mean}
+    figures = {
+        "rmse": float(np.sqrt(_squared_error(truth, volume) / truth.size)),
+        "variation": float(volume[body].std()) / mean,
+    }
     if hot.any():
-        figures["recovery"] = (float(volume[hot].mean()) / mean - 1) / (float(truth[hot].mean()) / level - 1)
+        ratio = float(volume[hot].mean()) / mean
+        figures["recovery"] = (ratio - 1) / (float(truth[hot].mean()) / level - 1)
+        parts, count = ndimage.label(hot)
+        seen, true = (ndimage.mean(image, parts, range(1, count + 1)) for image in (volume / mean, truth / level))
+        figures |= {"signal_to_background": ratio, "sbr_error": float(np.abs(seen / true - 1).max())}
     if cold.any():
         figures["spillover"] = float(volume[cold].mean()) / mean
     return figures

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64, I64
 from recon.base.empirical import EMPTY, ENOUGH_MATTER
 from recon.base.geometry import Geometry
 from recon.base.views import spread
@@ -19,6 +19,7 @@ LEAST = 0.1
 """Line integral at an edge above which matter is there: more than phase fringes, scatter and a drift of air leave."""
 
 _VIEWS, _ROWS, _PARTS = 32, 128, 4  # looked at, about; parts of the views
+_FEWEST = 2  # of the views looked at, in which matter goes out of the field
 _FULL = 0.5  # share of the fullest row's mass that a row needs
 
 
@@ -29,10 +30,13 @@ class FieldEdges:
     Attributes:
         levels: line integral at each edge ("left", "right") that should show air, the least of the quarters of a scan.
         mean: of the views.
+        of_views: line integral at these edges [view] of the `views` that were looked at.
     """
 
     levels: Mapping[str, float]
     mean: float
+    of_views: Mapping[str, F64] = field(default_factory=dict)
+    views: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
@@ -62,7 +66,8 @@ class FieldEdges:
             side: min(_median(part) for part in np.array_split(values, min(_PARTS, len(values))))
             for side, values in edges.items()
         }
-        return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))))
+        of_views = {side: np.array([_median(view) for view in values]) for side, values in edges.items()}
+        return cls(levels, float(np.median(np.nan_to_num(some).mean(axis=(1, 2)))), of_views, views)
 
     def beyond(self, least: float = LEAST) -> dict[str, float]:
         """The edges beyond which the sample goes on, with their line integrals; empty where it is in the field.
@@ -71,6 +76,20 @@ class FieldEdges:
             least: line integral that a beam which changes may leave; 0 of views whose air is at zero.
         """
         return {side: level for side, level in self.levels.items() if level > max(least, EMPTY * self.mean)}
+
+    def passing(self) -> dict[str, tuple[int, int]]:
+        """The edges at which matter goes out of the field in a part of the scan, with the first and last such view.
+
+        Empty where a view has matter at both edges: it is wider than the field, or the beam has changed.
+        """
+        least = max(LEAST, EMPTY * self.mean)
+        at = {side: levels > least for side, levels in self.of_views.items()}
+        count = sum(flags.astype(int) for flags in at.values())
+        if self.beyond() or not at or np.max(count) > 1 or not _FEWEST <= np.sum(count) < self.views.size:
+            return {}
+        return {
+            side: (int(self.views[flags][0]), int(self.views[flags][-1])) for side, flags in at.items() if flags.any()
+        }
 
 
 def _median(values: F32) -> float:

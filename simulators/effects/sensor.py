@@ -8,17 +8,13 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.orca_quest import BITS
+from drivers.orca_quest import BITS, QE_NM, LightPath, quantum_efficiency
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Positive, Share, Whole
 from simulators.frame.sensor import DARK_CURRENT, FULL_WELL, OFFSET, READ_NOISES
 from simulators.frame.shot import CannotExposeError, Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal, poisson
 from simulators.pixels.pattern import binned, normals
-
-NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
-EFFICIENCY = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 0.46, 0.40, 0.33, 0.30, 0.20, 0.09)
-"""ORCA-Quest 2 at NM, read off the catalogue's figure: 600 to 800 nm may be 0.1 to 0.15 too low."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +26,26 @@ class QuantumEfficiency(ImageEffect):
 
     Attributes:
         value: 0 ... 1, or
-        wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly.
+        wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly, or
+        path: the way from X-ray photons, of which photons_per_s then are; their noise is not that of light, see
+        `PhotonNoise`.
     """
 
     value: Share | None = None
-    wavelength_nm: Annotated[float, Field(ge=NM[0], le=NM[-1])] | None = None
+    wavelength_nm: Annotated[float, Field(ge=QE_NM[0], le=QE_NM[-1])] | None = None
+    path: LightPath | None = None
 
     def __post_init__(self) -> None:
-        if (self.value is None) == (self.wavelength_nm is None):
-            raise ValueError(f"give either value or wavelength_nm, got {self}")
+        if sum(each is not None for each in (self.value, self.wavelength_nm, self.path)) != 1:
+            raise ValueError(f"give either value or wavelength_nm, or path, got {self}")
 
     @property
     def efficiency(self) -> float:
-        """Detected share of the photons."""
+        """Photoelectrons a photon."""
+        if self.path is not None:
+            return self.path.absorbed * self.path.electrons
         if self.wavelength_nm is not None:
-            return float(np.interp(self.wavelength_nm, NM, EFFICIENCY))
+            return quantum_efficiency(self.wavelength_nm)
         assert self.value is not None
         return self.value
 

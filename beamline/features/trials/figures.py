@@ -10,7 +10,6 @@ import numpy as np
 
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.projections.scan_statistics import dose_scale
 from beamline.report.figures import WIDTH, new_figure, one_panel, png
 from recon.methods import names
 
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+_KINDS = "os^vD"  # markers of kinds of scans
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _APART = 16.0  # pixels between two numbers on the same side of their points, at least
 _MARKERS = {
@@ -175,21 +175,35 @@ def figures_of_rows(table: TrialTable, values: Mapping[str, Value]) -> bytes:
     return png(figure)
 
 
-def against_cost(table: TrialTable, label: str, value: Value) -> bytes:
-    """A figure of all rows against dose and against time, a colour a method."""
+def against_cost(table: TrialTable, label: str, value: Value, costs: Mapping[str, Callable[[Outcome], float]]) -> bytes:
+    """A figure of all rows against each cost, a colour a method and a line a family of rows.
+
+    Args:
+        costs: by the labels of their axes.
+    """
     figure = new_figure((WIDTH, 3.6))
-    by_dose, by_time = figure.subplots(1, 2, sharey=True)
-    a_frame, dose = dose_scale(table.light)
-    for method, pairs in _by_method(table, value).items():
-        doses, times = ([o.trial.frames * a_frame for o, _ in pairs], [o.cpu_seconds for o, _ in pairs])
-        for axes, cost in ((by_dose, doses), (by_time, times)):
-            axes.plot(cost, [v for _, v in pairs], "o", ms=4, color=colour_of(method), label=method)
-    by_dose.set(xlabel=dose, ylabel=label, xscale="log")
-    by_time.set(xlabel="processor time (s)", xscale="log")
-    for axes in (by_dose, by_time):
+    panels = figure.subplots(1, len(costs), sharey=True)
+    for axes, (name, cost) in zip(panels, costs.items(), strict=True):
+        for method, pairs in _by_method(table, value).items():
+            for n, kind in enumerate(dict.fromkeys(_kind(o) for o, _ in pairs)):
+                same = [(cost(o), v) for o, v in pairs if _kind(o) == kind]
+                style, words = (f"{_KINDS[n % len(_KINDS)]}-", f"{method}, {kind}") if kind else ("o", method)
+                axes.plot(*zip(*same, strict=True), style, ms=4, lw=0.8, color=colour_of(method), label=words)
+        axes.set_xlabel(name)
+        _scale(axes, [cost(outcome) for outcome in table.compared])
         axes.grid(alpha=0.3)
-    by_dose.legend(fontsize=8)
+    panels[0].set_ylabel(label)
+    if any(_kind(outcome) for outcome in table.compared):
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    else:
+        panels[0].legend(fontsize=8)
     return png(figure)
+
+
+def _kind(outcome: Outcome) -> str:
+    """Of a row that is a scan of its own; else empty."""
+    choice = outcome.trial.choice
+    return choice.label.partition(":")[0] if choice is not None and choice.facts else ""
 
 
 def _by_method(table: TrialTable, value: Value) -> dict[str, list[tuple[Outcome, float]]]:

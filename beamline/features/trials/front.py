@@ -40,6 +40,9 @@ def _period(value: float) -> str:
 _FIGURES = {
     "psnr": _Figure("PSNR", "PSNR (dB)", "dB against the truth", _digits("psnr")),
     "ssim3d": _Figure("SSIM", "SSIM 3D", "mean over the slices of three directions", _digits("ssim3d")),
+    "rmse": _Figure("RMSE", "RMSE", "of the activity", _digits("rmse")),
+    "signal_to_background": _Figure("S/B", "signal/background", "hot regions over the body", _digits("recovery")),
+    "sbr_error": _Figure("S/B err", "its largest error", "of a hot region, relative", _digits("sbr_error")),
     "recovery": _Figure("hot", "contrast recovery", "contrast of hot regions over the truth's", _digits("recovery")),
     "spillover": _Figure("cold", "spillover", "level of cold regions over the body's", _digits("spillover")),
     "variation": _Figure("noise", "noise", "standard deviation of the body over its level", _digits("variation")),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -15,18 +16,22 @@ from beamline.core.events import Sink, StudyStarted
 from beamline.core.files import REPORT
 from beamline.core.machine import machine
 from beamline.core.sinks import Warn
+from beamline.features.trials.dose import taken_scans
 from beamline.features.trials.figures import against_cost, figures_of_rows
 from beamline.features.trials.front import dose_columns
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.layout import TableColumn, TableLayout, metric_column, records
-from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
+from beamline.features.trials.runner import ComparedScan, OpenedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
+from beamline.features.trials.view_choices import DOSE, SCAN_TIME, Study, ViewChoice, ViewSet
+from beamline.projections.scan_statistics import dose_scale
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS, Metric
 from beamline.report.sheets import SliceSheet
 from drivers.base.clock import Clock
+from recon.assess import metrics
+from recon.base.arrays import F32, F64
 from recon.base.choices import Filter
 from recon.base.method import Plain
 from recon.methods import BASELINE, by_name
@@ -36,6 +41,7 @@ _FIGURES = {
     "psnr_all": ("PSNR all views", "psnr"), "ssim_all": ("SSIM all views", "ssim3d"),
     "psnr_truth": ("PSNR truth", "psnr"),
     "ssim_truth": ("SSIM truth", "ssim3d"), "snr": ("SNR rims", "snr"), "cnr": ("CNR rims", "cnr"),
+    "residual_held_out": ("residual", "residual_held_out"),
 }  # fmt: skip
 """Heading, and the metric that says how many digits it has, by name in files."""
 _MEASURED = {"psnr_truth": "psnr", "ssim_truth": "ssim3d"}  # names of metrics against the truth where trials end
@@ -77,15 +83,12 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    path, opened = options.scan.source.path, opened_scan(options.scan, warn)
-    prepared, truth = opened.prepared, opened.truth is not None
-    geometry = prepared.geometry
-    turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
-    places = np.concatenate((geometry.shifts, turns), axis=1)
-    choices = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
+    path, rows, regions = options.scan.source.path, options.study.rows, None
+    opened, choices = taken_scans(options.scan, warn) if rows is None else _chosen_views(options, rows, warn)
+    prepared, truth, geometry = opened.prepared, opened.truth is not None, opened.prepared.geometry
     table = TrialTable(
         tuple(_row(choice, method, options) for choice in choices for method in options.methods),
-        "psnr_all",
+        "psnr" if rows is None else "psnr_all",
         prepared.length_unit,
         machine(),
         {**opened.facts, "views to choose from": str(geometry.n_views)},
@@ -109,9 +112,40 @@ def planned_study(options: StudyOptions, warn: Warn) -> tuple[TrialData, Planned
         if method != BASELINE
     )
     references = (fbp, *(trial.in_time(options.seconds) for trial in others))
-    data = TrialData(replace(prepared, held_out=None), opened.truth)
     started = StudyStarted(path, len(table.todo), len(table.outcomes) - len(table.todo), options.study.name)
+    if opened.truth is not None and rows is None:
+        with suppress(ValueError):  # no contrast
+            regions = metrics.kmeans_mask(metrics.sampled(opened.truth), options.seed)
+        return TrialData(prepared, opened.truth, regions=regions), Planned(table, layout_of(options.study), started)
+    data = TrialData(replace(prepared, held_out=None), opened.truth)
     return data, Planned(table, layout_of(options.study), started, references)
+
+
+def _chosen_views(
+    options: StudyOptions, rows: Callable[[ViewSet], Sequence[ViewChoice]], warn: Warn
+) -> tuple[OpenedScan, Sequence[ViewChoice]]:
+    """A scan that was taken, and the views of it that each row has."""
+    opened = opened_scan(options.scan, warn)
+    geometry = opened.prepared.geometry
+    turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
+    places = np.concatenate((geometry.shifts, turns), axis=1)
+    clear = clearest(np.mod(geometry.angles, geometry.period), opened.prepared.projections.data)
+    return opened, rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places, clear))
+
+
+def clearest(angles: F64, lines: F32) -> int:
+    """The middle, in degrees, of the 40 degrees in which the densest hundredth of a view's rays meets least matter.
+
+    Args:
+        angles: [view], radians within half a turn.
+        lines: [view, row, col].
+    """
+    dense = np.array([np.percentile(view[:: max(1, len(view) // 16)], 99) for view in lines])
+    middles = np.arange(20, 161)
+    near = np.abs(np.degrees(angles) - middles[:, None]) <= 20
+    counts = near.sum(axis=1)
+    means = np.divide(near @ dense, counts, out=np.full(middles.size, np.inf), where=counts > 0)
+    return int(middles[np.argmin(means)])
 
 
 def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
@@ -121,20 +155,29 @@ def _row(choice: ViewChoice, method: str, options: StudyOptions) -> Outcome:
 
 
 def _notes(options: StudyOptions, n_views: int, truth: bool) -> list[str]:
-    notes = [
-        f"PSNR and SSIM of {REFERENCE} are against the volume of {REFERENCE} ({n_views}) by the same method (fbp: "
-        f"{options.filter}): they tell what fewer views lose, not which method is better. It has noise of its own, "
-        "which rows share as far as they share its views.",
-        "SNR and CNR are of the whole dense and empty region, with their rims (k-means of the "
-        + ("truth" if truth else f"FBP of {REFERENCE}")
-        + "), unlike those of beamline recon; a smoother volume has more.",
-    ]
+    notes = (
+        [
+            "exposure: s of a view. light: of the beam, over the configuration's. scan time: s from the first view to "
+            "the end of the last. dose: photons a pixel in the open beam while views are exposed; the shutter is open "
+            "in between, too. blur: px at the edge of the field. residual: of standing views that no row has. SNR and "
+            "CNR: whole regions of the truth, with their rims."
+        ]
+        if options.study.rows is None
+        else [
+            f"PSNR and SSIM of {REFERENCE} are against the volume of {REFERENCE} ({n_views}) by the same method (fbp: "
+            f"{options.filter}): they tell what fewer views lose, not which method is better. It has noise of its own, "
+            "which rows share as far as they share its views.",
+            "SNR and CNR are of the whole dense and empty region, with their rims (k-means of the "
+            + ("truth" if truth else f"FBP of {REFERENCE}")
+            + "), unlike those of beamline recon; a smoother volume has more.",
+        ]
+    )
     for method, settings in options.settings.items():
         if settings:
             notes.append(f"{method}: {', '.join(f'{name} {value}' for name, value in settings.items())}.")
     if options.seconds is not None:
         notes.append(f"Each row had {options.seconds:g} s; direct methods take what they take.")
-    if truth:
+    if truth and options.study.rows is not None:
         notes.insert(1, "PSNR truth and SSIM truth are against the truth.")
     return notes
 
@@ -158,6 +201,7 @@ def _columns(table: TrialTable) -> Sequence[TableColumn]:
         TableColumn("window", lambda o: _choice(o).window),
         TableColumn("frames", lambda o: o.trial.frames),
         *dose_columns(table),
+        *(TableColumn(name, partial(_fact, name), name, name, 11, partial(_fact_text, name)) for name in _facts(table)),
         TableColumn("status", lambda o: o.status),
         TableColumn("seconds_asked", lambda o: o.trial.seconds_asked, "s asked" * timed, "s asked", 9, _asked),
         TableColumn("seconds", lambda o: o.seconds, "s" * timed, "s", shown=lambda o: f"{o.seconds:.1f}"),
@@ -177,7 +221,12 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
         pictures.append(("figures.png", Picture("Figures of all rows", caption, picture)))
         first = "psnr_truth" if "psnr_truth" in figures else figures[0]
         caption = "Each frame of the scan has the same dose; one that several views share is counted once."
-        picture = against_cost(table, axes[first], partial(value_of, first))
+        a_frame, dose = dose_scale(table.light)
+        costs = {dose: lambda o: o.trial.frames * a_frame, "processor time (s)": lambda o: o.cpu_seconds}
+        if _facts(table):
+            caption = "A line joins the plans of a kind and method, from many views to few."
+            costs = {"dose (photons a pixel)": partial(_fact, DOSE), "scan time (s)": partial(_fact, SCAN_TIME)}
+        picture = against_cost(table, axes[first], partial(value_of, first), costs)
         pictures.append(("cost.png", Picture("Quality against dose and time", caption, picture)))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
@@ -190,6 +239,19 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Sequence[tuple[str, Pict
 def _choice(outcome: Outcome) -> ViewChoice:
     assert outcome.trial.choice is not None
     return outcome.trial.choice
+
+
+def _facts(table: TrialTable) -> list[str]:
+    """Headings of what is known of how views were taken."""
+    return list(dict.fromkeys(name for outcome in table.outcomes for name in _choice(outcome).facts))
+
+
+def _fact(name: str, outcome: Outcome) -> float:
+    return _choice(outcome).facts.get(name, math.nan)
+
+
+def _fact_text(name: str, outcome: Outcome) -> str:
+    return f"{_fact(name, outcome):.4g}"
 
 
 def value_of(name: str, outcome: Outcome) -> float | None:

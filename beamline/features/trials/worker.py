@@ -70,7 +70,8 @@ def run(
         DataError: the disk did not take the volume.
     """
     if trial.choice is not None:
-        prepared = averaged(data.prepared, trial.choice)
+        prepared = averaged(replace(data.prepared, held_out=None), trial.choice)
+        prepared = replace(prepared, geometry=_turning(prepared.geometry, trial.choice.arc))
     else:
         angles, period = data.geometry.angles, data.geometry.period
         prepared = data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
@@ -138,6 +139,11 @@ def measured(
         figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
         squared = left.tolist()
     return figures, squared
+
+
+def _turning(geometry: Geometry, arc: float) -> Geometry:
+    """The geometry of views whose stage turned by `arc` radians in an exposure; without any, as it is."""
+    return geometry.seen_with(replace(geometry.width, arc=arc), geometry.skew) if arc else geometry
 
 
 def _always(volume: F32) -> VolumeAt:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,7 @@ class Tuning:
     longest: float  # exposure that the period and the camera allow
     angle: float  # of the view, rad
     faults: tuple[str, ...]  # what is wrong with darks and flats at the configured exposure
+    x_rays: float = math.nan  # X-ray photons a count; NaN where optics.light_path is not known
 
     @property
     def photons(self) -> float:
@@ -99,6 +100,8 @@ class Tuning:
                 f"and camera allow up to {self.longest:.4g})",
             ),
         ]
+        if not math.isnan(self.x_rays):
+            words[4:4] = [("X-rays", f"{self.x_rays:.3g} photons a count by optics.light_path: --photons-per-count")]
         if math.isnan(self.advised):
             words[3:] = [("exposure", "not known until the fault is mended")]
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
@@ -123,7 +126,9 @@ def tune(
     frames, settings = take(_blocks(exposures, angle), config, instrument, stop, sink)
     timing = camera.timing
     longest = _longest(plan, settings, timing)
-    return evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
+    found = evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
+    path = config.optics.light_path
+    return found if path is None else replace(found, x_rays=path.x_rays_per_count(found.gain))
 
 
 def take(

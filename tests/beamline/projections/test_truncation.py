@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -19,9 +21,12 @@ ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
 SELECTION = Selection(axis_col=31.5)
 
 
-def scan(radius: float, light: np.ndarray | float = 1.0) -> ArraySource:
-    """A disc about the axis in a beam with noise, of which `light` is left in each view; darks and flats before."""
-    u = np.arange(SHAPE[1]) - 31.5
+def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) -> ArraySource:
+    """A disc in a beam with noise, of which `light` is left in each view; darks and flats before.
+
+    Its middle lies `beside` columns from the axis, along the beam at first.
+    """
+    u = np.arange(SHAPE[1]) - 31.5 - beside * np.sin(ANGLES)[:, None, None]
     lines = np.broadcast_to(2 * MU * np.sqrt(np.clip(radius**2 - u**2, 0, None)), (VIEWS, *SHAPE))
     rng = np.random.default_rng(2)
     open_beam = np.full((5, *SHAPE), 40_000.0)
@@ -42,6 +47,19 @@ def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: fl
     c = (np.arange(64) - 31.5)[None]
     middle = volume[np.hypot(c, c.T) < 28].mean()
     assert middle == pytest.approx(MU, rel=0.1)
+
+
+def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_with_its_views() -> None:
+    told: list[str] = []
+    prepare_projections(scan(28.0, beside=15.0), SELECTION, told.append)  # type: ignore[arg-type]
+    (line,) = (line for line in told if "leaves the field" in line)  # a disc's views are mirror images, too
+    views = re.search(r"leaves the field at the right edge in views (\d+) to (\d+) of 90", line)
+    assert views is not None  # a line integral of 0.1 is at the edge at 25 and 155 degrees
+    assert np.abs(np.array(views.groups(), float) - (13, 77)).max() <= 4
+    for radius, beside in ((20.0, 8.0), (40.0, 3.0), (45.0, 0.0)):
+        told.clear()
+        prepare_projections(scan(radius, beside=beside), SELECTION, told.append)  # type: ignore[arg-type]
+        assert not any("leaves the field" in line for line in told), (radius, beside)
 
 
 @pytest.mark.parametrize(("ring_current", "told_of_current"), [("ignore", True), ("use", False)])

@@ -37,6 +37,7 @@ CONVERSION = sensor.CONVERSION["standard"]
         ({"wavelength_nm": 450}, 0.85),
         ({"wavelength_nm": 535}, 0.73),  # between 0.80 at 500 and 0.70 at 550 nm
         ({"wavelength_nm": 1000}, 0.09),
+        ({"path": {"absorbed": 0.25, "light": 100, "aperture": 0.6, "index": 1.0, "transmission": 0.5}}, 0.9125),
     ],
 )
 def test_a_share_of_the_light_is_detected(effect: dict[str, float], share: float) -> None:

@@ -20,6 +20,7 @@ from beamline.features.tuning.tune import TARGET, evaluate, tune
 from beamline.instrument.connect import connect
 from beamline.monitor.references import ReferenceLimits
 from drivers.base.frame import Frame, FrameKind
+from drivers.orca_quest import LightPath
 from simulators.frame.sensor import CONVERSION, OFFSET
 from tests.beamline.acquired import assert_safe
 from tests.beamline.ball_scan import shipped, with_scene
@@ -115,10 +116,34 @@ def test_the_demo_is_tuned_with_its_own_camera() -> None:
         assert found.dark == pytest.approx(OFFSET["standard"], abs=2)
         assert found.saturated > 0.9 and found.exposure == pytest.approx(0.095 / 8, rel=0.01)
         again = load(config_folder() / "demo.yaml", [*words, f"scan.exposure_s={found.advised}"], {})
+        assert math.isnan(found.x_rays)
         better = tune(again, instrument, StopRequest(), lambda event: None, angle=0.7)
     assert (better.saturated, better.faults) == (0.0, ())
     assert better.brightest == pytest.approx(TARGET * 65535, rel=0.02)
     assert better.advised == pytest.approx(found.advised, rel=0.03)
+
+
+def test_x_rays_a_count_are_found_though_each_makes_several_electrons() -> None:
+    """Variance 1 + g times that of single electrons: photon transfer finds 1 + g times the counts of an electron."""
+    path = LightPath(absorbed=0.25, light=100, aperture=0.6, index=1.0, transmission=0.5)
+    assert path.electrons == pytest.approx(100 * 0.1 * 0.5 * 0.73)
+    rng, conversion = np.random.default_rng(1), 0.107
+    counts = path.electrons * rng.poisson(0.25 * 1000, 200_000) + rng.normal(0, 1, 200_000)  # light of each is steady
+    counts = rng.poisson(counts) / conversion
+    gain = counts.var() / counts.mean()
+    assert path.x_rays_per_count(gain) == pytest.approx(1000 / counts.mean(), rel=0.02)
+
+
+def test_tune_states_the_x_rays_a_count() -> None:
+    config = load(config_folder() / "demo.yaml", [
+        "scan.exposure_s=0.02", "simulation.clock=virtual",
+        "optics.light_path={absorbed: 0.2, light: 625, aperture: 0.4}",
+    ], {})  # fmt: skip
+    with connect(config) as instrument:
+        found = tune(config, instrument, StopRequest(), lambda event: None)
+    assert config.optics.light_path is not None
+    assert found.x_rays == config.optics.light_path.x_rays_per_count(found.gain)
+    assert any("X-rays" in line and "--photons-per-count" in line for line in found.lines())
 
 
 def test_lost_frames_are_the_cameras_fault_and_the_instrument_is_safe() -> None:
