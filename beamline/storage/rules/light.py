@@ -23,7 +23,7 @@ from beamline.storage.rules.references import (
     reference_groups,
 )
 from drivers.base.frame import FrameKind
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64, median_deviation
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
@@ -43,6 +43,8 @@ BELOW, OF_VIEWS = (
     0.005,
     0.25,
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
+CUT, SOLID = 0.01, 0.9  # shares: of pixels with such neighbours; of these, that hold the end; clipped noise has half
+WHITE = 0.8  # change from pixel to pixel over that of the next but one: noise has 1, structure a quarter to a half
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 """Limits, each with its reason."""
 
@@ -149,6 +151,47 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         yield Finding("warning" if accepted else "error", "light", sentence)
 
 
+def counts_cut(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
+    """Flats of one number stand for all light, unless the air of the views has it without the noise of the sample.
+
+    Counts then end there. Beside a number that stands for a transmission of 1, half of the air lies below it, or no
+    image has noise.
+
+    Args:
+        accepted: a fault is a warning.
+    """
+    groups = groups_taken(source)
+    if source.quantity != "counts" or not (groups.darks and groups.flats):
+        return
+    dark, flat = (np.stack(cells_of(source, np.concatenate(rows))) for rows in (groups.darks, groups.flats))
+    if np.ptp(dark) or np.ptp(flat):
+        return
+    views = read_known(source, spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)).astype(
+        np.float64
+    )
+    end, noise = float(flat.flat[0]), _white_noise(views, float(flat.flat[0]))
+    at = views >= end
+    around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
+    if noise > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
+        sentence = (
+            f"Every pixel of the flats, and {at.mean():.0%} of those of the views looked at, hold {end:g} without the "
+            f"noise of the others ({noise:.3g} from pixel to pixel): counts end there, and the light is not known. "
+            "Shorten the exposure or add a filter."
+        )
+        sentence += "" if accepted else " --references accept uses these as they are."
+        yield Finding("warning" if accepted else "error", "light", sentence)
+
+
+def _white_noise(views: F64, end: float) -> float:
+    """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more."""
+    below = np.where(views < end, views, np.nan)
+    near, far = (below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n] for n in (1, 2))
+    deviations = [
+        median_deviation(each[np.isfinite(each)]) / 2 if np.isfinite(each).any() else 0 for each in (near, far)
+    ]
+    return deviations[0] if deviations[0] > WHITE * deviations[1] else 0.0
+
+
 def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
     """Frames are no image that was written for them all; a single one does not tell."""
     return rows.size > 1 and bool(np.ptp(read_known(source, rows[:2]), axis=0).any())
@@ -184,11 +227,9 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
 
 
 def _multiple(source: ScanSource, rows: NDArray[np.int64]) -> int:
-    """The largest power of two of which all counts of a frame are multiples; 1 of real numbers."""
-    image = read_known(source, [int(rows[0])])[0]
-    if image.dtype.kind not in "ui":
-        return 1
-    common = int(np.gcd.reduce(image.ravel().astype(np.int64)))
+    """The largest power of two of which all counts of frames are multiples; 1 of real numbers."""
+    images = read_known(source, spread(rows, VIEWS))
+    common = int(np.gcd.reduce(images.astype(np.int64), axis=None)) if images.dtype.kind in "ui" else 1
     return common & -common if common else 1
 
 

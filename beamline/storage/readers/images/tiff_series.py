@@ -27,7 +27,7 @@ from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.ending import ScanEnding
@@ -66,6 +66,7 @@ class TiffSeriesSource(ScanSource):
         except BaseException:
             self.close()
             raise
+        self._two_orders = two_orders([without_angle(name) for name in series])
         self._missing, gaps = _left_out(images)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
@@ -73,7 +74,10 @@ class TiffSeriesSource(ScanSource):
 
     @property
     def not_used(self) -> tuple[NotUsed, ...]:
-        return offered(self)
+        where, why = "a second number in the names of the images", "images are in the order of the number that counts "
+        why += "closest; if angles are in the order of the other, leave one of them out of the names"
+        second = NotUsed(where, "which counts them in another order than the first", why, True)
+        return (*offered(self), *((second,) if self._two_orders else ()))
 
     @property
     def ending(self) -> ScanEnding:
