@@ -116,23 +116,27 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
     return None
 
 
-def ring_offsets(residual: F32, axis_col: float) -> F32:
+def ring_offsets(residual: F32, geometry: Geometry) -> F32:
     """Offsets of single pixels [row, col] that stay in all views and become rings in a volume.
 
     It is the median of the residual over the views, less its neighbourhood along the row. The wall of a can around the
     axis stays in all views, too, in all rows alike (-1.1 dB on a battery), and on both sides of the axis. So of what
     rows have in common only that counts which the other side lacks, see `without_layers`. Offsets below three standard
-    errors of their scatter between blocks of views count by the share that gains have in them, as columns differ from
-    those on the other side (Wiener). With few views noise cannot be separated from the sample: then all are 0.
+    errors of their scatter between blocks of neighbouring angles count by the share that gains have in them, as columns
+    differ from those on the other side (Wiener). With few views noise cannot be separated from the sample: then all are
+    0. What a model leaves of the sample changes with the angle: blocks of views taken in another order would agree on
+    it, and parts of the sample would count as rings (-0.5 dB).
 
     Args:
         residual: views less a model's views, [view, row, col].
-        axis_col: column of the rotation axis.
     """
     n, rows, cols = residual.shape
+    axis_col = geometry.axis_col
     if n < _RING_VIEWS or cols < _NEIGHBOURS:
         return np.zeros((rows, cols), np.float32)
-    blocks = np.stack([_fine(np.median(part, axis=0)) for part in np.array_split(residual, min(n // _BLOCK, _BLOCKS))])
+    by_angle = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
+    parts = np.array_split(by_angle, min(n // _BLOCK, _BLOCKS))
+    blocks = np.stack([_fine(np.median(residual[part], axis=0)) for part in parts])
     steady = blocks.mean(axis=0)
     shared = median_filter(steady, (min(rows, _NEIGHBOURS), 1), mode="nearest")
     steady += without_layers(shared, axis_col) - shared

@@ -339,7 +339,7 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
     if not (data.any() and model.any()):
         return None
     data, weights = _without_outliers(data, weights, model)
-    return data - ring_offsets(data - model, problem.geometry.axis_col), weights
+    return data - ring_offsets(data - model, problem.geometry), weights
 
 
 def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:

@@ -92,7 +92,7 @@ def unexplained(
     left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
     left = left - projector.forward(part.data)
     left[unseen] = 0
-    left -= ring_offsets(left, views.axis_col)
+    left -= ring_offsets(left, views)
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))

@@ -155,7 +155,7 @@ class _Band:
             method = FistaTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
             if gains and at + 1 < _ROUNDS:
-                left = ring_offsets(data - projector.forward(volume.data), self.geometry.axis_col) * self._told_apart()
+                left = ring_offsets(data - projector.forward(volume.data), views) * self._told_apart()
                 data -= left
                 gains_so_far += left
         assert volume is not None

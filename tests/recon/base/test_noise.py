@@ -90,10 +90,14 @@ def test_what_stays_in_a_pixel_over_all_views_is_a_ring_and_what_moves_is_not(rn
     noise = rng.normal(0, 0.2, (60, 6, 50)).astype(np.float32)
     crack = np.zeros((60, 6, 50), np.float32)
     crack[np.arange(60), :, (25 + 20 * np.cos(np.arange(60) / 10)).astype(int)] = 1.5
-    found = ring_offsets(noise + rings + crack, 24.5)
+    views = Geometry.parallel(np.arange(60) * np.pi / 60, (6, 50), axis_col=24.5)
+    found = ring_offsets(noise + rings + crack, views)
     np.testing.assert_allclose(found[rings != 0], rings[rings != 0], atol=0.12)
     assert np.count_nonzero(np.abs(found[rings == 0]) > 0.06) < 0.02 * rings.size
-    assert not ring_offsets((noise + rings)[:10], 24.5).any()  # too few views to tell
+    assert not ring_offsets((noise + rings)[:10], views.select(range(10))).any()  # too few views to tell
+    order = rng.permutation(60)  # in which views were taken
+    again = ring_offsets((noise + rings + crack)[order], views.select(order))
+    np.testing.assert_array_equal(again, found)
 
 
 def test_a_wall_around_the_axis_is_no_ring_and_a_stripe_of_all_rows_is(rng: np.random.Generator) -> None:
@@ -101,7 +105,8 @@ def test_a_wall_around_the_axis_is_no_ring_and_a_stripe_of_all_rows_is(rng: np.r
     wall, rings = np.zeros((12, 50), np.float32), np.zeros((12, 50), np.float32)
     wall[:, 12:14], wall[:, 37:39] = 0.5, 0.5
     rings[5, 12], rings[:, 30] = 0.5, 0.3
-    found = ring_offsets(rng.normal(0, 0.2, (60, 12, 50)).astype(np.float32) + wall + rings, 25.0)
+    views = Geometry.parallel(np.arange(60) * np.pi / 60, (12, 50), axis_col=25.0)
+    found = ring_offsets(rng.normal(0, 0.2, (60, 12, 50)).astype(np.float32) + wall + rings, views)
     np.testing.assert_allclose(found[rings != 0], rings[rings != 0], atol=0.15)
     assert np.abs(found[rings == 0]).max() < 0.2 and np.count_nonzero(np.abs(found[rings == 0]) > 0.1) <= 1
 
