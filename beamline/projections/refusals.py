@@ -14,7 +14,7 @@ from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import angle_order
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.light import counts_cut, darks_beside_views
+from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.scan import quantity_stated, references_present, scan_ended, scan_findings
 from beamline.storage.rules.treatment import frames_flagged
@@ -34,7 +34,6 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     judged = judged_flags(source) if asked.judged and source.finished else None
     findings = [*scan_findings(source), *scan_ended(source)]
     findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
-    findings += counts_cut(source, asked.accepted)
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:

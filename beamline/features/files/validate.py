@@ -18,7 +18,7 @@ from beamline.storage.readers.base import LookedEnoughError, ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules.finding import Finding
-from beamline.storage.rules.light import counts_cut, darks_beside_views
+from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.references import VIEWS, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, scan_ended
 from beamline.storage.rules.treatment import frames_flagged
@@ -97,7 +97,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 def source_findings(source: ScanSource) -> list[Finding]:
     """What the rules of scans find in an open one, what is wrong with its references, and what is flagged."""
     findings = list[Finding]()
-    for rule in (*SOURCE_RULES, scan_ended, references_usable, darks_beside_views, counts_cut, frames_flagged):
+    for rule in (*SOURCE_RULES, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
         except LookedEnoughError as error:

@@ -114,7 +114,7 @@ def light_beside_flats(
 
 
 def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
-    """Darks are images, and no place of the views has fewer counts: light only adds.
+    """Darks are images, no place of the views has fewer counts, as light only adds, and counts do not end in the air.
 
     Args:
         accepted: all are used as they are, so that a fault is a warning.
@@ -124,6 +124,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     groups = groups_taken(source) if accepted else reference_groups(source).good()
     if not (groups.darks and groups.flats):
         return
+    yield from _counts_cut(source, groups, accepted)
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
     if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
@@ -151,25 +152,18 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         yield Finding("warning" if accepted else "error", "light", sentence)
 
 
-def counts_cut(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
+def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> Iterator[Finding]:
     """Flats of one number stand for all light, unless the air of the views has it without the noise of the sample.
 
     Counts then end there. Beside a number that stands for a transmission of 1, half of the air lies below it, or no
     image has noise.
-
-    Args:
-        accepted: a fault is a warning.
     """
-    groups = groups_taken(source)
-    if source.quantity != "counts" or not (groups.darks and groups.flats):
-        return
     dark, flat = (np.stack(cells_of(source, np.concatenate(rows))) for rows in (groups.darks, groups.flats))
     if np.ptp(dark) or np.ptp(flat):
         return
-    views = read_known(source, spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)).astype(
-        np.float64
-    )
-    end, noise = float(flat.flat[0]), _white_noise(views, float(flat.flat[0]))
+    some = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views, end = read_known(source, some, _middle(source)).astype(np.float64), float(flat.flat[0])
+    noise = _white_noise(views, end)
     at = views >= end
     around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
     if noise > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
@@ -185,11 +179,17 @@ def counts_cut(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
 def _white_noise(views: F64, end: float) -> float:
     """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more."""
     below = np.where(views < end, views, np.nan)
-    near, far = (below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n] for n in (1, 2))
-    deviations = [
-        median_deviation(each[np.isfinite(each)]) / 2 if np.isfinite(each).any() else 0 for each in (near, far)
-    ]
-    return deviations[0] if deviations[0] > WHITE * deviations[1] else 0.0
+    near, far = (
+        median_deviation(below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n]) / 2
+        for n in (1, 2)
+    )
+    return near if near > WHITE * far else 0.0
+
+
+def _middle(source: ScanSource) -> slice:
+    """Rows about the middle, in which noise is looked at."""
+    middle = source.shape[0] // 2
+    return slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
 
 
 def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
@@ -239,11 +239,9 @@ def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of views, so that their quietest places count.
     """
-    middle = source.shape[0] // 2
-    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
     views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     taken = [np.concatenate(groups.darks), spread(max(groups.flats, key=len), VIEWS), views]
-    darks, flats, seen = (read_known(source, some, rows).astype(np.float32) for some in taken)
+    darks, flats, seen = (read_known(source, some, _middle(source)).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0
     light = flats.mean(axis=0) - darks.mean(axis=0)
