@@ -8,13 +8,12 @@ in one line time, so row r starts r / 2 line times after row 0.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 
 from drivers.base.protocols import CameraSettings, CameraTiming
-from drivers.flat import MEGABYTES, key
+from drivers.flat import MEGABYTES, Declared, key
 from recon.base.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)
@@ -126,7 +125,7 @@ class HotPixelMode(StrEnum):
 
 
 @dataclass(frozen=True)
-class DcamOptions:
+class DcamOptions(Declared):
     """Options of a `DcamCamera`.
 
     trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of
@@ -166,13 +165,3 @@ class DcamOptions:
         0.01, "By which fraction (and one line time) the camera may change an exposure before it is refused.", ge=0
     )
     ring: int = key(1000, "Most memory for the ring; a full frame has 18.9 MB.", unit=MEGABYTES, gt=0, le=1_000_000)
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.trigger_times <= 10_000:
-            raise ValueError(f"trigger_times must be 1 to 10000, not {self.trigger_times}")
-        if not 0 <= self.trigger_delay <= 10:  # also refuses NaN
-            raise ValueError(f"trigger_delay must be 0 to 10 s, not {self.trigger_delay}")
-        if not (math.isfinite(self.exposure_tolerance) and self.exposure_tolerance >= 0):
-            raise ValueError(f"exposure_tolerance is a fraction of 0 or more, not {self.exposure_tolerance}")
-        if self.ring < 1:
-            raise ValueError(f"ring must be positive, not {self.ring}")

@@ -28,17 +28,16 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_held_out import axis_by_views
-    from recon.features.emission.likelihood import attenuation_factors, mlem
-    from recon.features.emission.methods import Mlem, Osem
-    from recon.features.iterative.asd_pocs import AsdPocs as AsdPocs
-    from recon.features.iterative.cgls import Cgls as Cgls
-    from recon.features.iterative.sart import Sart as Sart
-    from recon.features.iterative.sirt import Sirt as Sirt
+    from recon.features.emission.methods import Mlem, Osem, attenuation_factors, mlem
+    from recon.features.iterative.methods import AsdPocs as AsdPocs
+    from recon.features.iterative.methods import Cgls as Cgls
+    from recon.features.iterative.methods import Sart as Sart
+    from recon.features.iterative.methods import Sirt as Sirt
     from recon.features.joint.energy_fit import EnergyViews
+    from recon.features.joint.learnt_motion import register_energies
     from recon.features.joint.methods import EnergySeries, TimeSeries
-    from recon.features.joint.registration import register_energies
+    from recon.features.joint.proportions import fit_share
     from recon.features.joint.series import TimedViews, TimedVolumes, fit_series
-    from recon.features.joint.share_fit import fit_share
     from recon.features.joint.spectral import Materials, fit_materials
     from recon.features.neural.methods import NAF as NAF
     from recon.features.neural.methods import IntraTomo as IntraTomo
@@ -47,8 +46,7 @@ if TYPE_CHECKING:
     from recon.features.rings.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
-    from recon.prep.counts import Counts
-    from recon.prep.emission import Emission, weighted_lines
+    from recon.prep.counts import Counts, Emission, weighted_lines
     from recon.reconstruction import reconstruct
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.r2 import R2
@@ -56,9 +54,7 @@ if TYPE_CHECKING:
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
-    from recon.voxels.methods.fista_tv import FistaTv
-    from recon.voxels.methods.os_sirt_tv import OsSirtTv
-    from recon.voxels.methods.pnp_dct import PnpDct
+    from recon.voxels.methods import FistaTv, OsSirtTv, PnpDct
     from recon.voxels.projector import Projector
 
 __all__ = [
@@ -128,15 +124,15 @@ _LAZY = {
     "Counts": "recon.prep.counts",
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings.rings"),
     "reconstruct": "recon.reconstruction",
-    "register_energies": "recon.features.joint.registration",
+    "register_energies": "recon.features.joint.learnt_motion",
     **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.features.joint.series"),
     "EnergyViews": "recon.features.joint.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.features.joint.spectral"),
-    "fit_share": "recon.features.joint.share_fit",
+    "fit_share": "recon.features.joint.proportions",
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
-    **dict.fromkeys(("Emission", "weighted_lines"), "recon.prep.emission"),
-    **dict.fromkeys(("attenuation_factors", "mlem"), "recon.features.emission.likelihood"),
+    **dict.fromkeys(("Emission", "weighted_lines"), "recon.prep.counts"),
+    **dict.fromkeys(("attenuation_factors", "mlem"), "recon.features.emission.methods"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),

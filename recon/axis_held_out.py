@@ -9,8 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, bin_views
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
@@ -18,7 +17,7 @@ from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
 from recon.voxels.field_edges import wider_than_field
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 
 COLS = 128  # Columns that show the axis to 0.05 of their pixels; more cost time

@@ -14,14 +14,13 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Method, Progress, ReconProblem, RunControl, SignedMethod
+from recon.base.method import Method, ReconProblem, RunControl, SignedMethod
 from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
 from recon.splatting.fit_method import FitMethod
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import IterativeMethod, Watch, solve
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -162,11 +161,7 @@ def _refitted(
     def told(iteration: int, residual: float) -> bool:
         nonlocal done, stopped
         done += 1
-        if control.on_progress is not None:
-            seconds, n = control.now() - begin, problem.geometry.n_views
-            control.on_progress(
-                Progress(done, 2 * sweeps, seconds, math.nan, math.nan, 0, n, unit="sweeps of error bars")
-            )
+        control.tell_part(done, 2 * sweeps, begin, problem.geometry.n_views, "sweeps of error bars")
         stopped = stopped or control.stop()
         return stopped
 

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,33 +18,24 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock
 from recon.base.registry import in_folders
 from recon.base.volume import Grid, Volume
-from recon.base.work import Rate
+from recon.base.work import Rate, SizedRun
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.patches import denoise, patch_scratch
 from recon.kernels.cpu.vectors import add_product
 from recon.splatting import optimise
 from recon.splatting.backend import backend_for
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.in_time import covered
 from recon.splatting.initialise import count_for, sample_gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.splatting.work import covered
 from recon.voxels.direct import direct, direct_work
 from recon.voxels.projector import Projector
-from recon.voxels.sweeps import Sweeps
-from recon.voxels.tv import TotalVariationProx
+from recon.voxels.voxel_problem import Sweeps, TotalVariationProx
 
 _TV_STEPS = 3
 _SERIAL = ("draw",)  # operations of one thread
 RUNS = 3  # the quickest counts; one more comes first, and loads the code and the data
-
-
-class SizedRun(NamedTuple):
-    """An operation of some size: the two amounts of its work, and what does it."""
-
-    first: float
-    second: float
-    run: Callable[[], object]
 
 
 def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:
@@ -148,42 +138,40 @@ _FBP = {  # rows, columns and views for which FBP takes either way
 }
 
 
+def _direct(operation: str, beam: str, rows: int, cols: int, views: int) -> SizedRun:
+    """A direct method, for one of its operations."""
+    geometry, grid, data = views_of_disc(beam, rows, cols, views)
+    return SizedRun(*direct_work(geometry, grid).amounts[operation], partial(direct, data, geometry, grid, "hann"))
+
+
 def _filtered(which: str) -> tuple[SizedRun, ...]:
-    return tuple(
-        SizedRun(*direct_work(geometry, grid).amounts[f"fbp, {which}"], partial(direct, data, geometry, grid, "hann"))
-        for geometry, grid, data in (views_of_disc("parallel", *size) for size in _FBP[which])
-    )
+    return tuple(_direct(f"fbp, {which}", "parallel", *size) for size in _FBP[which])
 
 
 def _back_projected(which: str) -> tuple[SizedRun, ...]:
-    return tuple(
-        SizedRun(
-            *direct_work(geometry, grid).amounts[f"back-projection, {which}"],
-            partial(direct, data, geometry, grid, "hann"),
-        )
-        for geometry, grid, data in (views_of_disc(which, rows, cols, 12) for rows, cols in ((8, 96), (32, 128)))
-    )
+    return tuple(_direct(f"back-projection, {which}", which, *size, 12) for size in ((8, 96), (32, 128)))
 
 
 def views_of_disc(beam: str, rows: int, cols: int, views: int) -> tuple[Geometry, Grid, F32]:
     """Views of a disc with a hole, and the grid that matches them."""
     geometry = _geometry(beam, rows, cols, views)
     grid = Grid.matching(geometry)
-    width = cols * grid.voxel_size
+    return geometry, grid, Projector(geometry, grid).forward(_disc(grid).data)
+
+
+def _disc(grid: Grid) -> Volume:
+    """A disc with a hole, of density 1 over the grid's width."""
+    width = grid.shape[2] * grid.voxel_size
     _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
     disc = (np.hypot(x, y) < 0.4 * width) & ~(np.hypot(x - 0.1 * width, y) < 0.1 * width)
-    return geometry, grid, Projector(geometry, grid).forward((disc / width).astype(np.float32))
+    return Volume((disc / width).astype(np.float32), grid)
 
 
-def _fitted(beam: str) -> tuple[SizedRun, ...]:
-    return _steps(beam, 16, 96), _steps(beam, 48, 128)
-
-
-def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> SizedRun:
+def _step(beam: str, rows: int, cols: int, steps: int = 4) -> SizedRun:
     """Views of some steps of a fit, and what its Gaussians cover in them."""
     geometry, grid, data = views_of_disc(beam, rows, cols, 12)
     settings = FitSettings(policy=None)
-    gaussians = _drawn(geometry, grid)
+    gaussians = _drawn(grid, geometry.is_cone)
     state = optimise.init(gaussians, 0)
     problem = optimise.problem_of(data, geometry, grid, state.unit, settings)
     views = steps * settings.views_per_step
@@ -195,50 +183,26 @@ def _steps(beam: str, rows: int, cols: int, steps: int = 4) -> SizedRun:
     return SizedRun(views, views * covered(math.prod(grid.shape), gaussians.n), run)
 
 
-def _normalised(which: str) -> tuple[SizedRun, ...]:
-    return _made_problem(16, 96), _made_problem(64, 160)
-
-
-def _made_problem(rows: int, cols: int) -> SizedRun:
+def _views_of_fit(rows: int, cols: int) -> SizedRun:
     geometry, grid, data = views_of_disc("parallel", rows, cols, 12)
-    return SizedRun(
-        geometry.n_views,
-        data.size,
-        lambda: optimise.problem_of(data, geometry, grid, 1.0, FitSettings(), backend_for("cpu")),
-    )
+    make = partial(optimise.problem_of, data, geometry, grid, 1.0, FitSettings(), backend_for("cpu"))
+    return SizedRun(geometry.n_views, data.size, make)
 
 
-def _matter(grid: Grid) -> Volume:
-    width = grid.shape[2] * grid.voxel_size
-    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
-    disc = (np.hypot(x, y) < 0.4 * width) & ~(np.hypot(x - 0.1 * width, y) < 0.1 * width)
-    return Volume((disc / width + 0 * z).astype(np.float32), grid)
-
-
-def _drawn(geometry: Geometry, grid: Grid) -> Gaussians:
+def _drawn(grid: Grid, cone: bool = False) -> Gaussians:
     return sample_gaussians(
-        _matter(grid), count_for(grid, geometry.is_cone), np.random.default_rng(0), field_radius=math.inf,
+        _disc(grid), count_for(grid, cone), np.random.default_rng(0), field_radius=math.inf,
         kernel=FitSettings().kernel,
     )  # fmt: skip
 
 
-def _draws(which: str) -> tuple[SizedRun, ...]:
-    return _draw(8, 64), _draw(32, 128)
-
-
 def _draw(rows: int, cols: int) -> SizedRun:
     grid = Grid((rows, cols, cols))
-    geometry = _geometry("parallel", rows, cols, 12)
-    return SizedRun(count_for(grid, False), math.prod(grid.shape), partial(_drawn, geometry, grid))
-
-
-def _fills(which: str) -> tuple[SizedRun, ...]:
-    return _fill(8, 64), _fill(32, 128)
+    return SizedRun(count_for(grid, False), math.prod(grid.shape), partial(_drawn, grid))
 
 
 def _fill(rows: int, cols: int) -> SizedRun:
-    grid = Grid((rows, cols, cols))
-    gaussians = _drawn(_geometry("parallel", rows, cols, 12), grid)
+    gaussians = _drawn(grid := Grid((rows, cols, cols)))
     return SizedRun(gaussians.n, math.prod(grid.shape), partial(voxelize, gaussians, grid))
 
 
@@ -258,10 +222,13 @@ OPERATIONS: Mapping[str, Callable[[str], tuple[SizedRun, ...]]] = {
     "patches": lambda which: _on_volume(_patched),  # lines, voxels
     "fbp": _filtered,  # rays, s on the machine of docs/notes/performance.md; by rays or by gridding
     "back-projection": _back_projected,  # lines x views, voxels x views; of a cone or of views in any pose
-    "views": _normalised,  # the data of a fit: views, rays
-    "view": _fitted,  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
-    "draw": _draws,  # first Gaussians: Gaussians, voxels
-    "fill": _fills,  # the volume of Gaussians: Gaussians, voxels
+    "views": lambda which: (_views_of_fit(16, 96), _views_of_fit(64, 160)),  # the data of a fit: views, rays
+    "view": lambda beam: (
+        _step(beam, 16, 96),
+        _step(beam, 48, 128),
+    ),  # of a step of a fit: views, views x what Gaussians cover; of a kind of beam
+    "draw": lambda which: (_draw(8, 64), _draw(32, 128)),  # first Gaussians: Gaussians, voxels
+    "fill": lambda which: (_fill(8, 64), _fill(32, 128)),  # the volume of Gaussians: Gaussians, voxels
     **{kind: partial(_of_feature, module) for kind, module in in_folders("recon.features", "OPERATIONS").items()},
 }
 """By name, with those of features: the folder of one names for each a module, whose `timed` makes them."""

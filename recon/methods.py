@@ -13,21 +13,16 @@ from typing import Any
 from recon.base.choices import AUTO
 from recon.base.declared_types import is_of_type, refusal, types_of
 from recon.base.method import Method
-from recon.base.method_entry import Lengths, MethodEntry
-from recon.base.registry import Registry, in_folders, unknown
+from recon.base.registry import Lengths, MethodEntry, Registry, in_folders, unknown
 
 REGISTRY: dict[str, MethodEntry] = {
     "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
     "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
-    "fista-tv": MethodEntry(
-        "recon.voxels.methods.fista_tv", "FistaTv", lengths=Lengths("iterations", (20, 5), (20, 5, 10, 40))
-    ),
+    "fista-tv": MethodEntry("recon.voxels.methods", "FistaTv", lengths=Lengths("iterations", (20, 5), (20, 5, 10, 40))),
     "os-sirt-tv": MethodEntry(
-        "recon.voxels.methods.os_sirt_tv", "OsSirtTv", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
+        "recon.voxels.methods", "OsSirtTv", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
     ),
-    "pnp-dct": MethodEntry(
-        "recon.voxels.methods.pnp_dct", "PnpDct", lengths=Lengths("iterations", (35,), (35, 15, 70))
-    ),
+    "pnp-dct": MethodEntry("recon.voxels.methods", "PnpDct", lengths=Lengths("iterations", (35,), (35, 15, 70))),
     **in_folders("recon.features", "METHODS"),
 }
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.declared_types import check_arguments
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, require_views
 from recon.base.masks import RayWeights
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
 from recon.base.method import Reconstruction as Reconstruction
@@ -20,8 +20,7 @@ from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import CostedMethod
 from recon.methods import DEFAULT, by_name, with_trait
-from recon.prep.counts import Counts, line_integrals
-from recon.prep.emission import Emission, weighted_lines
+from recon.prep.counts import Counts, Emission, line_integrals, weighted_lines
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -162,11 +161,9 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
 
 def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
     """Line integrals, and their weights times the given ones."""
-    shape, expected = np.shape(counts.counts), (geometry.n_views, *geometry.detector_shape)
-    if shape != expected:
-        raise ValueError(f"counts have shape {shape}, the geometry says {expected} [view, row, col]")
-    if use.weights is not None and np.shape(use.weights) != shape:
-        raise ValueError(f"weights have shape {np.shape(use.weights)}, the counts {shape}")
+    require_views(geometry, counts.counts, "counts")
+    if use.weights is not None:
+        require_views(geometry, use.weights, "weights")
     data, weights = weighted_lines(counts) if isinstance(counts, Emission) else line_integrals(counts)
     weights = weights if use.weights is None else weights * use.weights
     return data, replace(use, weights=weights, emission=counts if isinstance(counts, Emission) else None)
@@ -176,9 +173,7 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     given = np.asarray(projections.detach() if hasattr(projections, "detach") else projections)  # a tensor
     if given.dtype.kind not in "fiub":
         raise ValueError(f"projections must be real numbers, got {given.dtype}")
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if given.shape != expected:
-        raise ValueError(f"projections have shape {given.shape}, the geometry says {expected} [view, row, col]")
+    require_views(geometry, given)
     with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
         data = np.ascontiguousarray(given, np.float32)
     some = np.abs(data.reshape(-1)[:: max(1, data.size // _LOOKED_AT)])

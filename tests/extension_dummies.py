@@ -23,7 +23,7 @@ class Extension:
 
 METHOD = Extension(
     {
-        "recon/voxels/methods/grey.py": """
+        "recon/voxels/grey.py": """
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -55,7 +55,7 @@ class Grey:
         (
             "recon/methods.py",
             '    "fbp": MethodEntry("recon.voxels.direct", "Fbp"),',
-            '    "grey": MethodEntry("recon.voxels.methods.grey", "Grey"),',
+            '    "grey": MethodEntry("recon.voxels.grey", "Grey"),',
         ),
     ),
     """
@@ -178,8 +178,8 @@ class Half:
     (
         (
             "simulators/effects/catalogue.py",
-            '        "photon_noise": EffectRow(Domain.PHOTONS, "photons arrive at random"),',
-            '        "half": EffectRow(Domain.PHOTONS, "half of the light"),',
+            '        "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),',
+            '        "half": EffectRow(Domain.PHOTONS, "half of the light", module="simulators.effects.half"),',
         ),
     ),
     """

@@ -14,14 +14,14 @@ from beamline.config.beam import NoMonochromator
 from beamline.config.load import Config, changed, load, override_of
 from beamline.core.errors import ConfigError, ScanStopped, refuse_wrong_arguments
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
-from beamline.core.narration import sentence
 from beamline.core.run_result import RunResult
+from beamline.core.sinks import sentence
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import printable
 from beamline.instrument import connect as devices
 from beamline.scan.live_process import Commands, commands_of
 from beamline.scan.run import run_scan
-from drivers.manual import Ask
+from drivers.in_beam import Ask
 
 Say = Callable[[str], None]
 

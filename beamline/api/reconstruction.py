@@ -12,7 +12,7 @@ from typing import Any
 from beamline.api.instrument import Say, to_stderr
 from beamline.core.errors import ConfigError, DataError, refuse_wrong_arguments
 from beamline.core.events import Event, VolumeDone
-from beamline.core.narration import sentence
+from beamline.core.sinks import sentence
 from beamline.core.stop import StopOnSignal
 from beamline.energies.scans import EnergyScans, read_spectra
 from beamline.projections.selection import Selection

@@ -22,8 +22,7 @@ from beamline.cli.options import (
     together,
 )
 from beamline.core.errors import DataError
-from recon.assess.plans import MODEL_STEPS, PRESETS
-from recon.assess.time_model import parse_budget
+from recon.assess.time_model import MODEL_STEPS, PRESETS, parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel

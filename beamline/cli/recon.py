@@ -24,10 +24,9 @@ from beamline.cli.terminal import closed_terminal_ignored, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Done, Event, Failed, FitReached, ReconStarted, Sink, StateEntered
 from beamline.core.files import named_on_failure, new_log, refuse_existing, write_whole
-from beamline.core.narration import sentence
 from beamline.core.process import EndsWithParent
 from beamline.core.shipped import version
-from beamline.core.sinks import fan_out, while_it_works
+from beamline.core.sinks import fan_out, sentence, while_it_works
 from beamline.core.stop import StopOnSignal
 from beamline.core.text import printable
 from beamline.reconstruct.option_rules import SLABS_RESUMED, of_other_methods

@@ -226,7 +226,7 @@ def run_one(
     stop: StopRequest | None = None,
 ) -> RunResult:
     """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
-    from beamline.instrument.operator import ask_operator
+    from beamline.instrument.connect import ask_operator
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
@@ -265,7 +265,7 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
 
 def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
     """Take, or go on with, a scan of each energy, with the terminal and the page beside it."""
-    from beamline.instrument.operator import ask_operator
+    from beamline.instrument.connect import ask_operator
     from beamline.scan.energies import run_energies
 
     if request.discard:

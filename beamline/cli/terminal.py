@@ -31,12 +31,12 @@ from beamline.core.events import (
     VolumeDone,
 )
 from beamline.core.machine_speed import seconds_left
-from beamline.core.narration import sentence
+from beamline.core.sinks import sentence
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock
-from drivers.manual import Ask
+from drivers.in_beam import Ask
 from recon.base.registry import in_folders
 from recon.methods import BASELINE
 

@@ -1,16 +1,130 @@
-"""Configuration of what stands in the beam: its monitor, shutters and the monochromator."""
+"""Configuration of what stands in the beam: its monitor, shutters, the monochromator, and devices with named places."""
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from beamline.config.section import Section
+from beamline.config.stages import StageConfig
 from drivers.base.clock import Clock
-from drivers.base.protocols import BeamMonitor, ConnectedMonochromator, ConnectedShutter
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import BeamMonitor, ConnectedFilter, ConnectedMonochromator, ConnectedShutter
+from drivers.in_beam import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
+
+Name = Annotated[str, Field(min_length=1, max_length=80)]
+
+
+class MotorSection(Section):
+    """A motor of its own, any stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
+
+    speed_deg_s: Annotated[float, Field(gt=0)] | None = None
+    """null: the stage's max_speed_deg_s."""
+    stage: Annotated[StageConfig, Field(discriminator="kind")]
+
+    def _refuse_unreachable(self, places: Mapping[str, float]) -> None:
+        figures = self.stage.settings.figures
+        low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
+        for name, place in places.items():
+            if not low - 1e-9 <= place <= high + 1e-9:
+                raise ValueError(f"{name} {place:g} is beyond the limits of its stage, {low:g} ... {high:g}")
+        if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
+            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
+
+    def _places(self, degrees: Mapping[str, float], failed: str) -> StagePlaces:
+        speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
+        return StagePlaces({name: math.radians(place) for name, place in degrees.items()}, speed, failed)
+
+    def _connected(self, name: str, places: StagePlaces, clock: Clock, url: str | None) -> PlacedStage:
+        try:
+            return PlacedStage(self.stage.connect(clock, url), places, clock, name)
+        except DeviceError as cause:
+            raise cause.told_by(name, cause.problem) from cause
+
+
+class StageMover(MotorSection):
+    """A motor that takes the sample out of the beam for flats, between two places."""
+
+    kind: Literal["stage"]
+    in_deg: float
+    """Where the sample is in the beam."""
+    out_deg: float
+    """Where flats are taken."""
+
+    @model_validator(mode="after")
+    def _places_can_be_reached(self) -> Self:
+        self._refuse_unreachable({"in_deg": self.in_deg, "out_deg": self.out_deg})
+        if self.in_deg == self.out_deg:
+            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
+        return self
+
+    def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
+        """The mover, connected at its port or at `url`. Nothing moves.
+
+        Raises:
+            DeviceError: its stage does not answer, or does not fit.
+        """
+        places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not come")
+        return StageSampleMover(self._connected("sample mover", places, clock, url))
+
+
+class NoFilter(Section):
+    kind: Literal["none"] = "none"
+    places: ClassVar[Sequence[str]] = ()
+
+
+class NamedFilter(Section):
+    """A filter with nothing but names: simulated without an effect on the light, or changed by the operator."""
+
+    kind: Literal["simulated", "manual"]
+    places: Annotated[tuple[Name, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        if twice := [name for name in dict.fromkeys(self.places) if self.places.count(name) > 1]:
+            raise ValueError(f"places lists {', '.join(twice)} more than once; each place needs its own name")
+        return self
+
+
+class MotorFilter(MotorSection):
+    """Filters on a motor."""
+
+    kind: Literal["stage"]
+    places: Annotated[dict[Name, float], Field(min_length=1)]
+    """Name: deg."""
+
+    @model_validator(mode="after")
+    def _places_can_be_reached(self) -> Self:
+        self._refuse_unreachable(self.places)
+        refuse_equal(self.places)
+        return self
+
+    def connect(self, clock: Clock, url: str | None = None) -> PlacedStage:
+        """As that of `StageMover`."""
+        return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
+
+
+class FoundFilter(Section):
+    """Filters of a family of devices, see `beamline.config.families`."""
+
+    if TYPE_CHECKING:
+        kind: str
+        places: Mapping[str, float | str]
+
+    def connect(self, clock: Clock) -> ConnectedFilter:
+        """As that of `StageMover`."""
+        raise NotImplementedError
+
+
+def refuse_equal(places: Mapping[str, float | str]) -> None:
+    """Raise ValueError if two places have the same value."""
+    if len(set(places.values())) < len(places):
+        raise ValueError("two places have the same value and cannot be told apart; give each its own")
 
 
 class BeamMonitorSection(Section):

@@ -8,15 +8,20 @@ from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
 from beamline.config.beam import (
     BeamMonitorSection,
+    FoundFilter,
     FoundMonochromator,
     FoundShutter,
     HandMonochromator,
+    MotorFilter,
+    MotorSection,
+    NamedFilter,
     NoBeamMonitor,
+    NoFilter,
     NoMonochromator,
     SceneMonochromator,
+    StageMover,
     StageOutputShutter,
 )
-from beamline.config.places import FoundFilter, MotorFilter, MotorSection, NamedFilter, NoFilter, StageMover
 from beamline.config.section import Section, declared, read_from, section_of
 from beamline.config.stages import StageConfig
 from drivers import orca_quest

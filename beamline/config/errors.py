@@ -51,7 +51,7 @@ def _keys_of_real(found: Sequence[Any], data: Any, schema: Schema) -> dict[KeyPa
         if each["type"] != "extra_forbidden" or not path:
             continue
         group = _value(data, path[:-1])
-        others = [key for branch in _at(schema, path[:-1], None) for key in branch.get("properties", {})]
+        others = [key for branch in declared_at(schema, path[:-1], None) for key in branch.get("properties", {})]
         if str(group.get("kind", "")).startswith("simulated") and path[-1] in others:
             keys.setdefault(path[:-1], []).append(str(path[-1]))
     return keys
@@ -95,9 +95,9 @@ def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema)
         sentence = message.removeprefix(_OF_VALIDATOR)
         return f"{name}: {sentence}" if path else sentence
     if kind == "extra_forbidden":
-        keys = [key for branch in _at(schema, path[:-1], data) for key in branch.get("properties", {})]
+        keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
         return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
-    branches = _at(schema, path, data)
+    branches = declared_at(schema, path, data)
     choices = [str(choice) for branch in branches for choice in _choices(branch)]
     words = [_words(branch) for branch in branches if not _choices(branch)]
     legal = " | ".join(dict.fromkeys([*choices, *words]))
@@ -121,7 +121,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
+def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
     """The schemas for the value at `path`, by the kinds and schemes that the data choose."""
     branches = _branches(schema, data, schema)
     for part in path:

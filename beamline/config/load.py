@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from beamline.config.devices import DcamOrca
-from beamline.config.errors import explain
+from beamline.config.errors import declared_at, explain
 from beamline.config.models import Config as Config
 from beamline.config.models import (
     Fields,
@@ -88,27 +88,9 @@ def load(
 
 def takes_text(keys: Sequence[str]) -> bool:
     """Whether a key of the configuration takes any text, and nothing else but null."""
-    types: set[Any] = {Config}
-    for key in keys:
-        models: list[type[BaseModel]] = [
-            each for each in types if isinstance(each, type) and issubclass(each, BaseModel)
-        ]
-        types = {
-            member
-            for model in models
-            if key in model.model_fields
-            for member in _alternatives(model.model_fields[key].annotation)
-        }
-    return str in types and types <= {str, NoneType}
-
-
-def _alternatives(annotation: Any) -> list[Any]:
-    """The types of an annotation."""
-    if get_origin(annotation) is Annotated:
-        return _alternatives(get_args(annotation)[0])
-    if get_origin(annotation) in (Union, UnionType):
-        return [each for part in get_args(annotation) for each in _alternatives(part)]
-    return [annotation]
+    legal = declared_at(schema(), tuple(keys), None)
+    kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
+    return "string" in kinds and kinds <= {"string", "null"}
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
@@ -176,6 +158,7 @@ def resolved_yaml(config: Config) -> str:
     return f"# splatline {version()}\n{body}"
 
 
+@cache
 def schema() -> dict[str, Any]:
     """JSON schema of a configuration file."""
     return Config.model_json_schema()

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from beamline.config.beam import NoBeamMonitor, NoMonochromator, StageOutputShutter
+from beamline.config.beam import MotorSection, NoBeamMonitor, NoFilter, NoMonochromator, StageOutputShutter
 from beamline.config.devices import DeviceSection, SimulatedOrca
 from beamline.config.models import Config
-from beamline.config.places import MotorSection, NoFilter
 from beamline.config.section import Section
 from beamline.config.stages import StageSection
 from drivers.orca_quest import SENSOR_SHAPE

@@ -19,9 +19,9 @@ from beamline.core.files import write_whole
 from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
-from drivers.stages.kept import RestoresSettings
 from drivers.stages.registry import STAGES
 from drivers.stages.settings import StageSettings
+from drivers.stages.shared import RestoresSettings
 
 _IDENTITY = ("model", "serial", "device", "axis", "channel")
 

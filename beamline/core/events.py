@@ -67,7 +67,11 @@ class Event:
 
     def to_json(self) -> str:
         """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
-        return json.dumps({"event": self.event, "time": round(self.time, 6), **_plain(self.data)}, allow_nan=False)
+        from pydantic_core import to_jsonable_python  # here, because most commands write no line
+
+        values = {"event": self.event, "time": round(self.time, 6), **self.data}
+        line = to_jsonable_python(values, inf_nan_mode="null", fallback=_of_no_json_type)
+        return json.dumps(line, allow_nan=False)
 
 
 Sink = Callable[[Event], None]  # Takes events
@@ -175,22 +179,11 @@ def _values_of(value: Any) -> dict[str, Any]:
     return {each.name: getattr(value, each.name) for each in fields(value)}
 
 
-def _plain(value: Any) -> Any:
-    if is_dataclass(value):
-        value = _values_of(value)
+def _of_no_json_type(value: Any) -> Any:
+    """What a line of JSON has in place of a value that pydantic does not know."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_plain(v) for v in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    return value if value is None else str(value)
+        return dict(value)
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
 class RunStarted(Event, event="run_started"):

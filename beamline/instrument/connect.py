@@ -7,27 +7,29 @@ that names a simulator.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self, TypeVar
 
 import click
 
 from beamline.config.beam import (
     BeamMonitorSection,
+    FoundFilter,
     FoundMonochromator,
     FoundShutter,
+    MotorFilter,
+    NoFilter,
     NoMonochromator,
+    StageMover,
     StageOutputShutter,
 )
 from beamline.config.devices import DcamOrca, SimulatedOrca
 from beamline.config.load import Config, camera_settings
-from beamline.config.places import FoundFilter, MotorFilter, NoFilter, StageMover
 from beamline.core.errors import ConfigError
-from beamline.instrument.operator import ask_operator
-from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_beam_monitor, simulated_devices
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (
     BeamMonitor,
@@ -45,13 +47,57 @@ from drivers.base.protocols import (
     Watchable,
 )
 from drivers.frame_memory import FrameMemory
-from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
-from drivers.shutter import OutputShutter
+from drivers.in_beam import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter, OutputShutter
 from drivers.stages.travel import Travel
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import select
+
+
+from drivers.base.errors import DeviceError
+
+_STATE = "What was acquired so far is in the file"
+
+
+def ask_operator(request: str) -> None:
+    """Ask the operator at the terminal, and wait for Enter. DeviceError: there is no terminal, or no confirmation."""
+    if not sys.stdin.isatty():
+        advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
+        raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)
+    try:
+        # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
+        how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
+        click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
+    except click.Abort as error:  # the end of input
+        raise DeviceError("operator", "the request was not confirmed", request=request, state=_STATE) from error
+
+
+def enter_pressed() -> bool:
+    """Whether Enter was pressed at the terminal since the last call; False without a terminal. Does not wait."""
+    pressed = False
+    if not sys.stdin.isatty():
+        return False
+    if sys.platform == "win32":
+        while msvcrt.kbhit():
+            pressed |= msvcrt.getwch() in "\r\n"
+    else:
+        while select.select([sys.stdin], [], [], 0)[0] and sys.stdin.readline():
+            pressed = True
+    return pressed
+
+
 if TYPE_CHECKING:
+    from beamline.instrument.simulated import SimulatedScene
     from recon.base.volume import Grid, Volume
 
+
+class Closable(Protocol):
+    def close(self) -> None: ...
+
+
+Connected = TypeVar("Connected", bound=Closable)
 TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
 
 
@@ -94,8 +140,11 @@ def make_beam_monitor(config: BeamMonitorSection, clock: Clock) -> BeamMonitor:
     Raises:
         DeviceError: its port does not open.
     """
-    name = config.counterpart if config.simulated else None
-    return config.connect(clock, None if name is None else simulated_beam_monitor(name, config, clock))
+    if not config.simulated or config.counterpart is None:
+        return config.connect(clock, None)
+    from beamline.instrument.simulated import simulated_beam_monitor
+
+    return config.connect(clock, simulated_beam_monitor(config.counterpart, config, clock))
 
 
 @dataclass(frozen=True)
@@ -151,21 +200,20 @@ def connect(
             ask = ask or ask_operator
             devices = _instrument(config, clock, ask, check_stop, opened, memory)
             if isinstance(chosen := config.devices.sample_mover, StageMover):
-                mover = chosen.connect(clock)
-                opened.callback(mover.close)
-                devices = replace(devices, sample=mover)
+                devices = replace(devices, sample=_held(chosen.connect(clock), opened))
             devices = replace(
                 devices,
                 filter=_filter(config, clock, ask, opened),
                 monochromator=_monochromator(config, clock, ask, opened),
             )
         else:
+            from beamline.instrument.simulated import clock_of, simulated_devices
+
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
         if isinstance(wanted := config.devices.beam_monitor, BeamMonitorSection):
-            monitor = make_beam_monitor(wanted, clock)
-            opened.callback(monitor.close)
+            monitor = _held(make_beam_monitor(wanted, clock), opened)
 
         def watch(check: Callable[[], None]) -> None:
             for device in (devices.shutter, devices.sample, devices.filter, devices.monochromator):
@@ -200,6 +248,8 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     """
     limits = config.devices.stage.settings.limits()
     if config.simulation is not None:
+        from beamline.instrument.simulated import scene_of
+
         scene_of(config, config.scan.energy)
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     try:
@@ -209,23 +259,26 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     return limits, timing, Travel("stage", limits).to_counts
 
 
+def _held(device: Connected, opened: ExitStack) -> Connected:
+    """The device, which is closed at the end."""
+    opened.callback(device.close)
+    return device
+
+
 def _instrument(
     config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack, memory: FrameMemory
 ) -> Devices:
     chosen = config.devices.camera
     if isinstance(chosen, SimulatedOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
-    stage = config.devices.stage.connect(clock)
-    opened.callback(stage.close)
+    stage = _held(config.devices.stage.connect(clock), opened)
     camera: Camera
     if isinstance(chosen, DcamOrca):
-        camera = orca = make_camera(chosen, clock, memory)
-        opened.callback(camera.close)
+        camera = orca = _held(make_camera(chosen, clock, memory), opened)
         if chosen.cool_s:
             wait_until_cold(orca, chosen.cool_s, clock, check_stop)
     else:
-        camera = chosen.connect(clock)
-        opened.callback(camera.close)
+        camera = _held(chosen.connect(clock), opened)
     shutter = shutter_of(config, stage, clock, ask)
     if isinstance(shutter, ConnectedShutter):
         opened.callback(shutter.disconnect)
@@ -235,18 +288,14 @@ def _instrument(
 def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
     wanted = config.devices.filter
     if isinstance(wanted, MotorFilter | FoundFilter):
-        connected = wanted.connect(clock)
-        opened.callback(connected.close)
-        return connected
+        return _held(wanted.connect(clock), opened)
     return None if isinstance(wanted, NoFilter) else ManualFilter(ask)
 
 
 def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
     wanted = config.devices.monochromator
     if isinstance(wanted, FoundMonochromator):
-        connected = wanted.connect(clock)
-        opened.callback(connected.close)
-        return connected
+        return _held(wanted.connect(clock), opened)
     return None if isinstance(wanted, NoMonochromator) else ManualMonochromator(ask)
 
 

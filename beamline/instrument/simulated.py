@@ -1,6 +1,6 @@
 """Simulated instrument: simulated devices, behind the real drivers where these exist.
 
-Simulators are imported where they are needed, so that an instrument loads none.
+It is imported where it is needed, so that an instrument loads no simulator.
 """
 
 from __future__ import annotations
@@ -10,30 +10,45 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.beam import BeamMonitorSection, SceneMonochromator, StageOutputShutter
+from beamline.config.beam import (
+    BeamMonitorSection,
+    MotorFilter,
+    NoFilter,
+    SceneMonochromator,
+    StageMover,
+    StageOutputShutter,
+)
 from beamline.config.devices import SimulatedOrca
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
-from beamline.config.places import MotorFilter, NoFilter, StageMover
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
+from beamline.simulate.volumes import volumes_beside
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
-from drivers.manual import ManualFilter
-from drivers.shutter import OutputShutter
+from drivers.in_beam import ManualFilter, OutputShutter
 from recon.base.registry import in_folders
+from recon.base.volume import Grid, Volume
+from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
+from simulators.devices.clock import VIRTUAL_START, ScaledClock, VirtualClock
+from simulators.devices.shutter import (
+    SimulatedMonochromator,
+    SimulatedSampleMover,
+    SimulatedShutter,
+)
+from simulators.devices.trigger_line import TriggerLine
+from simulators.effects.chain import Label
+from simulators.frame.mapping import SceneError
+from simulators.frame.shot import CannotExposeError
+from simulators.scenes.scene import Scene, load_scene
+from simulators.wires.registry import WIRES
+from simulators.wires.serial_url import register
+from simulators.wires.wire import Controller
 
-if TYPE_CHECKING:
-    from recon.base.volume import Grid, Volume
-    from simulators.devices.camera import SimulatedOrcaQuest
-    from simulators.devices.shutter import BeamGate, SampleGate
-    from simulators.devices.trigger_line import TriggerLine
-    from simulators.effects.anomaly import Label
-    from simulators.scenes.scene import Scene
+IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
 
 
 @dataclass(frozen=True)
@@ -62,47 +77,39 @@ def simulated_devices(
     Raises:
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
-    from simulators.devices.camera import OrcaQuestBuild, SimulatedOrcaQuest
-    from simulators.devices.monochromator import SimulatedMonochromator
-    from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
-    from simulators.devices.trigger_line import TriggerLine
-    from simulators.wires.registry import WIRES
-    from simulators.wires.serial_url import register
 
     scene = scene_of(config)
     line = TriggerLine(clock)
-    chosen, wanted = config.devices.stage, config.devices.shutter
-    try:
-        controller = WIRES[chosen.kind].matching(chosen.settings).controller(clock, line)
-    except ValueError as error:
-        raise ConfigError(f"devices.stage.{error}. Nothing was started.") from error
-    # A name of its own for every connection: two in one process must not share a controller.
-    stage = chosen.connect(clock, register(f"{chosen.kind}-{uuid4().hex}", controller))
+    wanted = config.devices.shutter
+    controller, url = _wire("stage", config.devices.stage, clock, line)
+    stage = config.devices.stage.connect(clock, url)
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
-    blade: BeamGate = shutter
+    beam_is_on = shutter.is_open
     if isinstance(wanted, StageOutputShutter):  # the driver at one end of the cable, the blade at the other
         number, output = wanted.output, stage.digital_output(wanted.output)
         shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
-        blade = WiredShutter(lambda: controller.output_is_high(number), wanted.open_high)
+        open_high = wanted.open_high
+        beam_is_on = lambda: controller.output_is_high(number) is open_high  # noqa: E731
     sample: SampleMover
-    inside: SampleGate
-    sample = inside = SimulatedSampleMover()
+    sample = simulated = SimulatedSampleMover()
+    sample_is_in = simulated.is_in
     if isinstance(mover := config.devices.sample_mover, StageMover):
         axis = TriggerLine(clock)
-        sample = motor = mover.connect(clock, _wire(mover.stage, clock, axis))
+        sample = motor = mover.connect(clock, _wire("sample_mover.stage", mover.stage, clock, axis)[1])
         opened.callback(motor.close)
-        inside = MovedSample(axis, math.radians(mover.in_deg))
+        inside = math.radians(mover.in_deg)
+        sample_is_in = lambda: abs(axis.angle_at(clock.now()) - inside) < IN_PLACE  # noqa: E731
     changer: Filter | None = None
     if isinstance(wheel := config.devices.filter, MotorFilter):
-        changer = turned = wheel.connect(clock, _wire(wheel.stage, clock, TriggerLine(clock)))
+        changer = turned = wheel.connect(clock, _wire("filter.stage", wheel.stage, clock, TriggerLine(clock))[1])
         opened.callback(turned.close)
     elif not isinstance(wheel, NoFilter):  # its light is that of the scene
         changer = ManualFilter(lambda request: None)
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     build = OrcaQuestBuild(pixel_pitch=pitch, model=model)
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, build)
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, beam_is_on, sample_is_in, build)
     opened.callback(camera.close)
     monochromator: Monochromator | None = None
     if isinstance(section := config.devices.monochromator, SceneMonochromator):
@@ -113,13 +120,17 @@ def simulated_devices(
     return Devices(stage, camera, shutter, sample, changer, monochromator), known
 
 
-def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:
-    """The port of a simulated controller that turns `axis`. Two in one process must not share one."""
-    from simulators.wires.registry import WIRES
-    from simulators.wires.serial_url import register
+def _wire(device: str, stage: StageSection, clock: Clock, axis: TriggerLine) -> tuple[Controller, str]:
+    """A simulated controller that turns `axis`, and its port. Two in one process must not share one.
 
-    controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
-    return register(f"{stage.kind}-{uuid4().hex}", controller)
+    ConfigError: it lacks what the section of the device asks for.
+    """
+
+    try:
+        controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
+    except ValueError as error:
+        raise ConfigError(f"devices.{device}.{error}. Nothing was started.") from error
+    return controller, register(f"{stage.kind}-{uuid4().hex}", controller)
 
 
 def scene_of(config: Config, energy: float | None = None) -> Scene:
@@ -131,9 +142,6 @@ def scene_of(config: Config, energy: float | None = None) -> Scene:
     Raises:
         ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
     """
-    from beamline.simulate.volumes import volumes_beside
-    from simulators.frame.mapping import SceneError
-    from simulators.scenes.scene import load_scene
 
     stated_scene = config.simulation.scene if config.simulation else {}
     # Paths in a scene that stands in the configuration itself are full ones by now.
@@ -178,7 +186,6 @@ def _cone(scene: Scene) -> tuple[float, float] | None:
 
 
 def _rehearse(camera: SimulatedOrcaQuest) -> None:
-    from simulators.frame.shot import CannotExposeError
 
     try:
         camera.rehearse()
@@ -189,7 +196,6 @@ def _rehearse(camera: SimulatedOrcaQuest) -> None:
 def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
     """The simulation's clock: real, virtual or faster. The last two start at `not_before` (s since the Unix epoch) or
     later."""
-    from simulators.devices.clock import VIRTUAL_START, ScaledClock, VirtualClock
 
     if isinstance(kind, Speed):
         return ScaledClock(SystemClock(), kind.speed, not_before)
@@ -197,7 +203,6 @@ def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
 
 
 def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
-    from recon.base.volume import Volume
 
     def truth(grid: Grid) -> Volume:
         # The scene's z = 0 is the middle of the sensor, a reconstruction's the middle of the rows that were read.
@@ -211,7 +216,6 @@ def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
 
 def simulated_beam_monitor(name: str, config: BeamMonitorSection, clock: Clock) -> str:
     """The url of the simulated counterpart with this name, which shows a steady intensity."""
-    from simulators.wires.serial_url import register
 
     modules = in_folders("simulators.wires", "BEAM_MONITORS")
     wire = import_module(modules[name]).matching(config, clock)

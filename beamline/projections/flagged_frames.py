@@ -14,7 +14,7 @@ from beamline.storage.flag_legend import FlagBit, FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import groups_of
 from drivers.base.frame import FrameKind
-from recon.base.binning import bin_views
+from recon.base.arrays import bin_views
 
 if TYPE_CHECKING:
     from beamline.report.contact_sheet import FlaggedFrame

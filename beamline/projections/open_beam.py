@@ -29,7 +29,7 @@ from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
 from recon.prep.correct import Correction, CorrectionSettings, References
 from recon.prep.counts import Photons
-from recon.prep.defects import SHADOW_REACH, shadowed
+from recon.prep.references import SHADOW_REACH, shadowed
 
 _LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
 

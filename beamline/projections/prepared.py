@@ -21,7 +21,7 @@ from recon.base.method import Energies
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
-from recon.prep.emission import Emission
+from recon.prep.counts import Emission
 from recon.voxels.projector import seen_rays
 
 

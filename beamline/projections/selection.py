@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.projections.step import NamedStep
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
 from recon.base.views import parse_views
 
 if TYPE_CHECKING:

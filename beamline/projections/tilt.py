@@ -13,7 +13,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection
 from beamline.storage.readers.base import ScanSource
 from recon.base.views import spread_views
-from recon.prep.axis_search import FEWEST_BANDS
+from recon.prep.axis_wedge import FEWEST_BANDS
 from recon.prep.tilt import TiltEstimate, find_tilt
 
 MATTERS = 0.5

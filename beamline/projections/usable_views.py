@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import count
 from drivers.base.frame import FrameKind
-from recon.base.arrays import I64
-from recon.base.binning import bin_views
+from recon.base.arrays import I64, bin_views
 
 if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags

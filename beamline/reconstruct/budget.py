@@ -13,16 +13,15 @@ from beamline.core.machine_speed import MachineSpeed
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import binned, run_on
-from recon.assess.plans import Choice, Speeds, plans
-from recon.assess.time_model import duration_text
+from recon.assess.time_model import Choice, Speeds, duration_text, plans
+from recon.auto import LEFT, ROWS, part_of, predicts_best
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, TimedMethod
 from recon.base.volume import Grid
 from recon.base.work import Rates
 from recon.methods import with_settings
+from recon.splatting.in_time import speeds_of
 from recon.splatting.initialise import default_count
-from recon.splatting.work import speeds_of
-from recon.trials import LEFT, ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import wider_than_field
 

@@ -17,8 +17,7 @@ from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of
-from recon.base.slabs import Slab, part_of, slabs_of
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Slab, Volume, part_of, slabs_of
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import with_trait
 from recon.splatting.fit_method import FitMethod

@@ -19,8 +19,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
 from recon.base.method import Method, volumes_of
-from recon.base.slabs import Slab, slabs_of
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Slab, slabs_of
 from recon.base.work import Rates, Span, costs_of, parts_of, seconds_of
 
 _SHARED = 1.3  # from which the text says so

@@ -27,7 +27,7 @@ from beamline.reconstruct.run import run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from beamline.reconstruct.workers import cluster
 from drivers.base.clock import Clock
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Stop
 from recon.base.geometry import Geometry
 from recon.base.method import (
     BoundedMethod,
@@ -39,12 +39,10 @@ from recon.base.method import (
     RunControl,
     candidates_of,
 )
-from recon.base.slabs import Slab
-from recon.base.stop import Stop
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Slab
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.last_round import LastRound
+from recon.splatting.in_time import LastRound
 from recon.warm_up import warm_up
 
 

@@ -21,13 +21,11 @@ from beamline.reconstruct.remarks import (
 )
 from beamline.storage.scratch import scratch_array
 from drivers.base.clock import Clock
-from recon.assess.lost_mass import compare
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.voxels.direct import direct, has_direct_method
-from recon.voxels.stray_mass import StrayMass, stray_mass, stray_mass_share
-from recon.voxels.unexplained import Unexplained, unexplained
+from recon.voxels.matter_checks import StrayMass, Unexplained, lost_matter, stray_mass, stray_mass_share, unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
@@ -43,7 +41,7 @@ def judge(
     clock: Clock,
     in_parts: bool = False,
 ) -> VolumeLooks:
-    """Measure a volume, compare it with its views and with FBP, and tell `sink` of each warning.
+    """Measure a volume, lost_matter it with its views and with FBP, and tell `sink` of each warning.
 
     Looks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
 
@@ -221,7 +219,7 @@ class VolumeLooks:
             return lost
         fbp = self.volumes[BASELINE]
         for volume in self.volumes.values():
-            beside_fbp = compare(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
+            beside_fbp = lost_matter(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
             if beside_fbp is None:
                 break  # it shows no air
             self.warn(sentence := lost_mass_warning(self.made, beside_fbp))
@@ -240,7 +238,7 @@ class VolumeLooks:
             return
         self.warn(
             "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
-            "disk. Make it with --method fbp to compare."
+            "disk. Make it with --method fbp to lost_matter."
         )
 
     def tell_what_was_left_out(self) -> None:

@@ -38,7 +38,7 @@ from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
-from recon.splatting.last_round import LastRound
+from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
 
 BATCH_VIEWS = 32  # views corrected before the fit goes on

@@ -21,14 +21,12 @@ from beamline.reconstruct.workers import cluster
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
-from recon.base.slabs import Slab
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Slab
 from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
+from recon.voxels.matter_checks import stray_mass_memory, unexplained_memory
 from recon.voxels.odd_views import odd_views_memory
-from recon.voxels.stray_mass import stray_mass_memory
-from recon.voxels.unexplained import unexplained_memory
 
 SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
 

@@ -30,9 +30,9 @@ from beamline.storage.writer_lock import PATIENCE
 from beamline.storage.writers.partial_volume import can_become
 from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from recon.base.choices import Quality
+from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import EarlyStopMethod, Method, PresetMethod
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.methods import has_setting, names, streams
 from recon.splatting.fit_method import StreamingMethod

@@ -40,9 +40,8 @@ from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Stop
 from recon.base.method import BoundedMethod
-from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up

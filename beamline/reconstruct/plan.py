@@ -51,9 +51,8 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.slabs import Slab, slabs_of
 from recon.base.views import parse_views
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Slab, slabs_of
 from recon.splatting.backend import backend_for
 
 _BATCH = 0.25  # of the memory: views during correction

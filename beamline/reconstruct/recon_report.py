@@ -22,7 +22,7 @@ from recon.base.method import Reconstruction
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.methods import BASELINE
-from recon.voxels.unexplained import LIMIT, Unexplained
+from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
@@ -135,9 +135,9 @@ def _footnotes(
     if unexplained is not None:
         footnotes.append(
             "Matter that leaves structure: voxels at which the back-projected residual of "
-            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above {LIMIT:g} a "
-            "fit hides something. It compares fits of the same views: views that are displaced have more noise, so "
-            "less exceeds it."
+            f"{len(unexplained.significance)} slices exceeds four standard deviations of its noise; above "
+            f"{UNEXPLAINED_LIMIT:g} a fit hides something. It compares fits of the same views: views that are "
+            "displaced have more noise, so less exceeds it."
         )
     if "stray" in metrics[made.method]:
         footnotes.append(

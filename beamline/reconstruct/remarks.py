@@ -11,13 +11,13 @@ from beamline.core.text import count, spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.outcome import label_of
-from recon.assess.lost_mass import Comparison
 from recon.base.geometry import Geometry
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid
 from recon.methods import by_name
-from recon.splatting import needles
-from recon.voxels import odd_views, stray_mass, unexplained, view_weights
+from recon.splatting.gaussians import NEEDLES_LIMIT, needles
+from recon.voxels import odd_views, view_weights
+from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, LostMatter, StrayMass, Unexplained
 
 _NAMED = 5  # odd views, at most
 
@@ -41,7 +41,7 @@ def partly_seen_warning(geometry: Geometry) -> str:
     )
 
 
-def lost_mass_warning(made: Reconstruction, beside_fbp: Comparison) -> str:
+def lost_mass_warning(made: Reconstruction, beside_fbp: LostMatter) -> str:
     """The warning that a volume has lost weak matter that FBP shows; empty if it has not."""
     if beside_fbp.lost is None:
         return ""
@@ -73,15 +73,15 @@ def not_begun_warning(made: Reconstruction, residual: float, uniform: float) -> 
 _COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
 
 
-def hiding_warning(made: Reconstruction, structure: unexplained.Unexplained) -> str:
+def hiding_warning(made: Reconstruction, structure: Unexplained) -> str:
     """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
-    if structure.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
+    if structure.share <= UNEXPLAINED_LIMIT or by_name(made.method).traits.direct:
         return ""
     others = " and ".join(name for name in _COMPARED if name != made.method)
     return (
         f"{structure.share:.1%} of the matter leaves structure in the residual of the views (at most "
-        f"{unexplained.LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
-        f"at 'What the volume leaves in the views' in the report, and compare with --method {others}."
+        f"{UNEXPLAINED_LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
+        f"at 'What the volume leaves in the views' in the report, and lost_matter with --method {others}."
     )
 
 
@@ -97,13 +97,13 @@ def _crossing_sentence(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.
     )
 
 
-def stray_mass_warning(made: Reconstruction, stray: stray_mass.StrayMass) -> str:
+def stray_mass_warning(made: Reconstruction, stray: StrayMass) -> str:
     """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
-    if stray.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
+    if stray.share <= STRAY_LIMIT or by_name(made.method).traits.direct:
         return ""
     return (
         f"{stray.share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
-        f"(at most {stray_mass.LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
+        f"(at most {STRAY_LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
     )
 
 
@@ -111,12 +111,12 @@ def needles_warning(made: Reconstruction, geometry: Geometry) -> str:
     """The warning that a model is made of needles; empty if it is not, or if there is no model."""
     if made.gaussians is None or not made.gaussians.n:
         return ""
-    found = needles.needles(made.gaussians, geometry)
-    if found.share <= needles.LIMIT:
+    found = needles(made.gaussians, geometry)
+    if found.share <= NEEDLES_LIMIT:
         return ""
     return (
         f"{found.share:.0%} of the mass of the model is in Gaussians thinner than a pixel and ten times as long (at "
-        f"most {needles.LIMIT:.0%} is usual). They follow the noise of few views: compare with --method fista-tv."
+        f"most {NEEDLES_LIMIT:.0%} is usual). They follow the noise of few views: lost_matter with --method fista-tv."
     )
 
 

@@ -18,11 +18,10 @@ from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.options import OutputPaths
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
-from recon.base.arrays import F32
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, bin_views
+from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import BoundedMethod, DataUse, Method, Reconstruction, RunControl
-from recon.base.stop import Stop
 from recon.base.volume import Grid
 from recon.methods import by_name, with_settings
 from recon.splatting.fit_method import FitMethod

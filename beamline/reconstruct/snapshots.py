@@ -34,7 +34,7 @@ from recon.base.noise import noise_level
 from recon.base.views import spread
 from recon.base.volume import Volume
 from recon.prep.correct import Projections
-from recon.splatting.shown import BetterVolume
+from recon.splatting.anytime import BetterVolume
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices

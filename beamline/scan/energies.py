@@ -18,7 +18,6 @@ from beamline.core.run_result import RunResult
 from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
-from beamline.instrument.simulated import clock_of
 from beamline.scan.live_process import Commands
 from beamline.scan.preflight import dry_run, refuse_violations
 from beamline.scan.resume import (
@@ -34,7 +33,7 @@ from beamline.scan.runs import describe
 from beamline.scan.states import State
 from beamline.storage.interrupted import scan_file
 from drivers.base.clock import SystemClock
-from drivers.manual import Ask
+from drivers.in_beam import Ask
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,11 @@ def run_energies(
             return SeriesRun(series, tuple(complete), ())
         refuse_violations(dry_run(config, series or place, whole=[energy for energy, _ in complete]).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
-        clock = None if config.simulation is None else clock_of(config.simulation.clock, not_before=last)
+        clock = None
+        if config.simulation is not None:
+            from beamline.instrument.simulated import clock_of
+
+            clock = clock_of(config.simulation.clock, not_before=last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
         folder = series or _new_folder(config, place or Path(config.storage.folder))
         scans: list[tuple[float, Path]] = []

@@ -25,14 +25,11 @@ from beamline.core.errors import (
 from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
 from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.core.machine import free_memory
-from beamline.core.narration import UserLog
 from beamline.core.run_result import RunResult
-from beamline.core.sinks import Announcer, JsonLines
+from beamline.core.sinks import Announcer, JsonLines, UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
-from beamline.instrument.connect import ConnectedDevices, connect
-from beamline.instrument.operator import enter_pressed
-from beamline.instrument.simulated import clock_of
+from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
 from beamline.plan.angles import Retake, spread_retakes
 from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
@@ -50,7 +47,7 @@ from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import Clock, SystemClock
-from drivers.manual import Ask
+from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
 SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
@@ -156,6 +153,8 @@ def _clock(config: Config, series: ResumableRun | None) -> Clock | None:
     """A clock that goes on where the simulated one of the run stopped, as it starts anew in each process; else None."""
     if series is None or config.simulation is None:
         return None
+    from beamline.instrument.simulated import clock_of
+
     return clock_of(config.simulation.clock, not_before=series.last_frame_time)
 
 

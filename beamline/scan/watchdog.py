@@ -25,10 +25,9 @@ from pathlib import Path
 
 import psutil
 
-from beamline.config.beam import FoundMonochromator, FoundShutter
+from beamline.config.beam import FoundMonochromator, FoundShutter, MotorSection
 from beamline.config.devices import Simple
 from beamline.config.load import Config, load
-from beamline.config.places import MotorSection
 from beamline.core.events import Sink, Warned
 from beamline.core.files import CONFIG, WATCHDOG_LOG
 from beamline.core.process import ChildProcess

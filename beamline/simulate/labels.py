@@ -13,7 +13,7 @@ from beamline.core.files import write_whole
 from beamline.core.flag import PixelBox
 
 if TYPE_CHECKING:
-    from simulators.effects.anomaly import Label
+    from simulators.effects.chain import Label
 
 
 @dataclass(frozen=True)

@@ -2,21 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
-from drivers.flat import key
+from drivers.flat import Declared, key
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
 
 
+class _PvDevice:
+    """A device behind process variables, which are opened together."""
+
+    def __init__(self, name: str, clock: Clock, timeout: float) -> None:
+        """`timeout`: s, of each read and write."""
+        self.name, self._clock, self._timeout = name, clock, timeout
+        self._check: Callable[[], None] = lambda: None
+        self.disconnect: Callable[[], None]
+        """Close the connection; the device stays as it is."""
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again on the way; its exception ends the wait, and stops what can be
+        stopped."""
+        self._check = check
+
+    @contextmanager
+    def _opening(self, *urls: str) -> Iterator[list[ProcessVariable]]:
+        """The process variables at these addresses; an error in the context closes them again."""
+        with ExitStack() as opened:
+            channels = [open_channel(url, self.name, self._timeout) for url in urls]
+            for channel in channels:
+                opened.callback(channel.close)
+            yield channels
+            self.disconnect = opened.pop_all().close
+
+    def _waited(self, arrived: Callable[[], bool], travel: float, check: Callable[[], None] | None = None) -> bool:
+        """Wait at most `travel` s; whether it has arrived."""
+        deadline = self._clock.now() + travel
+        while not (there := arrived()) and self._clock.now() < deadline:
+            (check or self._check)()
+            self._clock.sleep(POLL)
+        return there
+
+
 @dataclass(frozen=True)
-class ShutterPvs:
+class ShutterPvs(Declared):
     """The process variables of a shutter, each as pva://NAME or ca://NAME; times in s."""
 
     open_pv: str = key(problem=url_problem)
@@ -31,7 +66,7 @@ class ShutterPvs:
     travel: float = key(10.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
 
 
-class PvShutter:
+class PvShutter(_PvDevice):
     """Implements `drivers.base.protocols.Shutter`. Opening and closing end when the status says so.
 
     `close` always writes, even if the status says closed.
@@ -43,21 +78,11 @@ class PvShutter:
     by_hand = False
 
     def __init__(self, pvs: ShutterPvs, clock: Clock, name: str = "shutter") -> None:
-        self.name = name
-        self._pvs, self._clock = pvs, clock
-        self._check: Callable[[], None] = lambda: None
-        with ExitStack() as opened:
-            self._opener, self._closer, self._status = (
-                _channel(url, name, pvs.timeout, opened)
-                for url in (pvs.open_pv, pvs.close_pv or pvs.open_pv, pvs.status_pv)
-            )
+        super().__init__(name, clock, pvs.timeout)
+        self._pvs = pvs
+        with self._opening(pvs.open_pv, pvs.close_pv or pvs.open_pv, pvs.status_pv) as channels:
+            self._opener, self._closer, self._status = channels
             _ = self.is_open()
-            self.disconnect: Callable[[], None] = opened.pop_all().close
-            """The shutter stays as it is."""
-
-    def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again while it opens; its exception ends the wait, not the move."""
-        self._check = check
 
     def open(self) -> None:
         if not self.is_open():
@@ -77,7 +102,7 @@ class PvShutter:
         request = f"{channel.name} = {value}"
         try:
             channel.write("", value)
-            arrived = _waited(lambda: self.is_open() is wanted, self._pvs.travel, self._clock, check)
+            arrived = self._waited(lambda: self.is_open() is wanted, self._pvs.travel, check)
         except DeviceError as cause:
             raise cause.told_by(self.name, cause.problem, request=request, state=NOT_KNOWN) from cause
         if not arrived:
@@ -93,26 +118,20 @@ class PvShutter:
             )
 
 
-@dataclass(frozen=True)
-class FilterPvs:
-    """The process variables of a filter, as pva://NAME or ca://NAME.
+@dataclass(frozen=True, kw_only=True)
+class FilterPvs(Declared):
+    """The process variables of a filter, as pva://NAME or ca://NAME; times in s."""
 
-    Attributes:
-        pv: takes the value of a place.
-        status_pv: where the filter itself is read, with the same values: numbers, texts or labels.
-        places: name -> value.
-        timeout: s, for each answer.
-        travel: s that the status may take to follow.
-    """
-
-    pv: str
-    status_pv: str
-    places: Mapping[str, float | str]
-    timeout: float = 2.0
-    travel: float = 30.0
+    pv: str = key(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
+    status_pv: str | None = key(
+        None, "Where the filter itself is read, with the same values; null: pv.", problem=url_problem
+    )
+    places: Mapping[str, float | str] = key(doc="Name: value.", min_length=1)
+    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = key(30.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
 
 
-class PvFilter:
+class PvFilter(_PvDevice):
     """Implements `drivers.base.protocols.Filter`. A move ends when the status says so.
 
     Raises:
@@ -120,18 +139,11 @@ class PvFilter:
     """
 
     def __init__(self, pvs: FilterPvs, clock: Clock, name: str = "filter") -> None:
-        self.name = name
-        self._pvs, self._clock = pvs, clock
-        self._check: Callable[[], None] = lambda: None
-        with ExitStack() as opened:
-            self._setter, self._status = (_channel(url, name, pvs.timeout, opened) for url in (pvs.pv, pvs.status_pv))
+        super().__init__(name, clock, pvs.timeout)
+        self._pvs = pvs
+        with self._opening(pvs.pv, pvs.status_pv or pvs.pv) as (self._setter, self._status):
             _ = self.place()
-            self.close: Callable[[], None] = opened.pop_all().close
-            """The filter stays where it is."""
-
-    def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again on the way; its exception ends the wait, not the move."""
-        self._check = check
+        self.close = self.disconnect
 
     def place(self) -> str | None:
         status = self._status_now()
@@ -142,7 +154,7 @@ class PvFilter:
         if self.place() == place:
             return
         self._setter.write("", value)
-        if not _waited(lambda: self.place() == place, self._pvs.travel, self._clock, self._check):
+        if not self._waited(lambda: self.place() == place, self._pvs.travel):
             raise DeviceTimeout(
                 self.name,
                 f"it did not come to {place} within {self._pvs.travel:g} s",
@@ -166,32 +178,35 @@ class PvFilter:
         return _valid(self._status, self.name)
 
 
-@dataclass(frozen=True)
-class MonochromatorPvs:
-    """The process variables of a monochromator, as pva://NAME or ca://NAME.
-
-    Attributes:
-        pv: takes the energy; a motor record's VAL, for instance.
-        status_pv: where the energy itself is read.
-        stop_pv: takes a 1 that stops it; None: it cannot be stopped.
-        per_kev: the number that they show at 1 keV; 1000 where they are in eV.
-        tolerance: keV, most difference of the energy from the one that was asked for.
-        settle: s that it must stay within the tolerance.
-        timeout: s, for each answer.
-        travel: s that a move may take, at most.
-    """
-
-    pv: str
-    status_pv: str
-    stop_pv: str | None = None
-    per_kev: float = 1.0
-    tolerance: float = 5e-4
-    settle: float = 1.0
-    timeout: float = 2.0
-    travel: float = 60.0
+class EnergyUnit(StrEnum):
+    KEV = "keV"
+    EV = "eV"
 
 
-class PvMonochromator:
+@dataclass(frozen=True, kw_only=True)
+class MonochromatorPvs(Declared):
+    """The process variables of a monochromator, as pva://NAME or ca://NAME; times in s, `tolerance` in eV."""
+
+    pv: str = key(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)
+    status_pv: str = key(doc="Where the energy itself is read.", problem=url_problem)
+    stop_pv: str | None = key(None, "Takes a 1 that stops it; null: it cannot be stopped.", problem=url_problem)
+    unit: EnergyUnit = key(EnergyUnit.KEV, "Of pv and status_pv.")
+    tolerance: float = key(
+        0.5, "Most difference of the energy from the one that was asked for.", unit="ev", gt=0, le=1e4
+    )
+    settle: float = key(
+        1.0, "Time that it must stay within tolerance_ev before the move has ended.", unit="s", ge=0, le=1e6
+    )
+    timeout: float = key(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = key(60.0, "The longest that a move may take.", unit="s", gt=0, le=1e6)
+
+    @property
+    def per_kev(self) -> float:
+        """The number that the process variables show at 1 keV."""
+        return 1e3 if self.unit is EnergyUnit.EV else 1.0
+
+
+class PvMonochromator(_PvDevice):
     """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has stayed there for `settle`.
 
     Raises:
@@ -199,19 +214,12 @@ class PvMonochromator:
     """
 
     def __init__(self, pvs: MonochromatorPvs, clock: Clock, name: str = "monochromator") -> None:
-        self.name = name
-        self._pvs, self._clock = pvs, clock
-        self._check: Callable[[], None] = lambda: None
-        with ExitStack() as opened:
-            self._setter, self._status = (_channel(url, name, pvs.timeout, opened) for url in (pvs.pv, pvs.status_pv))
-            self._stopper = None if pvs.stop_pv is None else _channel(pvs.stop_pv, name, pvs.timeout, opened)
+        super().__init__(name, clock, pvs.timeout)
+        self._pvs = pvs
+        with self._opening(pvs.pv, pvs.status_pv, *([pvs.stop_pv] if pvs.stop_pv else [])) as channels:
+            self._setter, self._status, *self._stoppers = channels
             _ = self.energy()
-            self.close: Callable[[], None] = opened.pop_all().close
-            """The monochromator stays where it is."""
-
-    def watch(self, check: Callable[[], None]) -> None:
-        """From now on `check` is called again and again on the way; its exception stops the move where that can be."""
-        self._check = check
+        self.close = self.disconnect
 
     def energy(self) -> float:
         status = _valid(self._status, self.name)
@@ -228,8 +236,8 @@ class PvMonochromator:
         self._setter.write("", wanted)
         deadline = clock.now() + pvs.travel
         try:
-            while _waited(lambda: self._is_at(energy), deadline - clock.now(), clock, self._check):
-                if not _waited(lambda: not self._is_at(energy), pvs.settle, clock, self._check):
+            while self._waited(lambda: self._is_at(energy), deadline - clock.now()):
+                if not self._waited(lambda: not self._is_at(energy), pvs.settle):
                     return
         except DeviceError:
             raise
@@ -241,49 +249,34 @@ class PvMonochromator:
             f"it did not come to {energy:.7g} keV and stay there within {pvs.travel:g} s",
             request=f"{self._setter.name} = {wanted:.7g}",
             reply=f"{self._status.name} is {_valid(self._status, self.name)}",
-            expected=f"{wanted:.7g}, within {pvs.tolerance * pvs.per_kev:g}",
+            expected=f"{wanted:.7g}, within {pvs.tolerance * 1e-3 * pvs.per_kev:g}",
             advice="Look where it is, and whether this computer may write to it",
         )
 
     def stop(self) -> None:
         """Stop it where it can be stopped. Raises DeviceError."""
-        if self._stopper is not None:
-            self._stopper.write("", 1)
+        for stopper in self._stoppers:
+            stopper.write("", 1)
 
     def remember_place(self) -> Callable[[], str]:
         """See `drivers.base.protocols.Rechecked`. It may be off for less than `settle`, as after a move."""
         before = self.energy()
 
         def moved() -> str:
-            if _waited(lambda: self._is_at(before), self._pvs.settle, self._clock, self._check):
+            if self._waited(lambda: self._is_at(before), self._pvs.settle):
                 return ""
             return f"it stood at {before:.7g} keV, and is at {self.energy():.7g} keV"
 
         return moved
 
     def _is_at(self, energy: float) -> bool:
-        return abs(self.energy() - energy) <= self._pvs.tolerance
+        return abs(self.energy() - energy) <= self._pvs.tolerance * 1e-3
 
 
 def _valid(channel: ProcessVariable, device: str) -> PvValue:
     (value,) = channel.read("")
     refuse_invalid(device, channel.name, value)
     return value
-
-
-def _channel(url: str, device: str, timeout: float, opened: ExitStack) -> ProcessVariable:
-    channel = open_channel(url, device, timeout)
-    opened.callback(channel.close)
-    return channel
-
-
-def _waited(arrived: Callable[[], bool], travel: float, clock: Clock, check: Callable[[], None] = lambda: None) -> bool:
-    """Wait at most `travel` s; whether it has arrived."""
-    deadline = clock.now() + travel
-    while not (there := arrived()) and clock.now() < deadline:
-        check()
-        clock.sleep(POLL)
-    return there
 
 
 class PvSource:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.flat import Key, flat_fields
+from drivers.flat import Declared, Key, flat_fields
 from drivers.flat import key as key
 
 FARTHEST = 1e9  # rad
@@ -33,7 +33,7 @@ def with_keys(name: str, driver: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class StageFigures:
+class StageFigures(Declared):
     """The limits of a stage: counts for 2π, rad/s, rad/s², soft limits in rad.
 
     Raises:
@@ -47,10 +47,9 @@ class StageFigures:
     high: float = key(365.0, "The stage is never sent beyond low_deg and high_deg.", unit="deg")
 
     def __post_init__(self) -> None:
-        if self.counts_per_turn < 1:
-            raise ValueError(f"a turn cannot have {self.counts_per_turn} counts")
+        super().__post_init__()
         for meaning, rate in (("speed", self.max_speed), ("acceleration", self.acceleration)):
-            if not 0 < rate * self.per_radian < MOST:
+            if not rate * self.per_radian < MOST:
                 raise ValueError(f"{rate:g} rad is not a possible {meaning} of a stage")
         if not -FARTHEST <= self.low < self.high <= FARTHEST:
             low, high = math.degrees(self.low), math.degrees(self.high)
@@ -96,12 +95,8 @@ class StageFigures:
 
 
 @dataclass(frozen=True)
-class Wiring:
-    """Connection of a stage's controller; times in s. The baud rate is the controller's, nominal over USB and TCP.
-
-    Raises:
-        ValueError: no reply can come in that timeout.
-    """
+class Wiring(Declared):
+    """Connection of a stage's controller; times in s. The baud rate is the controller's, nominal over USB and TCP."""
 
     timeout: float = key(1.0, "For a reply.", unit="s", gt=0)
     baudrate: int = key(115_200, gt=0)
@@ -112,10 +107,6 @@ class Wiring:
     transcript: Path | None = key(
         None, "A file to which every byte to and from the controller is appended with its time; null: none."
     )
-
-    def __post_init__(self) -> None:
-        if not 0 < self.timeout < math.inf:
-            raise ValueError(f"a timeout of {self.timeout:g} s is not possible; expected a positive number of seconds")
 
 
 class StageSettings(Protocol):

@@ -1,15 +1,86 @@
-"""Shared code of the stages: positions by their travel, stops, and the wait until they stand."""
+"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
+
+Settings that a driver changes in a controller are kept, as they were found, outside the program until they are
+restored: a program that is killed leaves its speed in the controller, and the next one would take it for the original.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import RotationStage, StageLimits
+from drivers.serial.line import LineRules, Probe, SerialLine
+from drivers.stages.settings import Wiring
 from drivers.stages.travel import Travel
+
+
+class SettingsStore(Protocol):
+    """Keeps the settings that a controller was found with, beyond the end of this program."""
+
+    def load(self) -> Mapping[str, str]:
+        """Settings that an earlier program found and did not restore; empty if it did."""
+
+    def save(self, found: Mapping[str, str]) -> None: ...
+
+    def clear(self) -> None:
+        """Forget the settings: all are restored."""
+
+
+@runtime_checkable
+class RestoresSettings(Protocol):
+    """A stage that changes settings of its controller, and restores them when it is closed."""
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        """From now on they are in `store`, too. Those of an earlier program that died are restored at the end instead
+        of what it left, and `describe` says so."""
+
+
+class FoundSettings:
+    """The settings that a controller was found with, by their names there, for the driver that changes them."""
+
+    def __init__(self) -> None:
+        self.values: dict[str, str] = {}
+        self.notice = ""
+        """What an earlier program left, in words; "" if it restored all."""
+        self._store: SettingsStore | None = None
+
+    def keep_in(self, store: SettingsStore) -> None:
+        """See `RestoresSettings.keep_found_settings`."""
+        earlier = {name: value for name, value in store.load().items() if name in self.values}
+        changed = {name: self.values[name] for name, value in earlier.items() if self.values[name] != value}
+        self.values |= earlier
+        store.save(self.values)
+        self._store = store
+        if changed:
+            values = ", ".join(f"{name} {value} for {earlier[name]}" for name, value in changed.items())
+            self.notice = (
+                f"a program that was killed, or lost this stage, left {values}; "
+                "what stood there before is restored at the end"
+            )
+
+    def restore(self, write: Callable[[str, str], object]) -> None:
+        """Write each setting back, once. If one is refused, the store keeps them all."""
+        values, self.values = self.values, {}
+        for name, value in values.items():
+            write(name, value)
+        if self._store is not None:
+            self._store.clear()
+            self._store = None
+
+
+def line_to(wiring: Wiring, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
+    connection: dict[str, Any] = {
+        "timeout": wiring.timeout,
+        "baudrate": wiring.baudrate,
+        "transcript": wiring.transcript,
+    }
+    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **connection)
 
 
 class Stops:
@@ -24,8 +95,13 @@ class Stops:
 
     def __init__(self, name: str, send: Callable[[bool], object]) -> None:
         self._name, self._send = name, send
-        self.count = 0
+        self.count = self._before = 0
         self._hard = False
+
+    @property
+    def came_since(self) -> bool:
+        """Whether a stop came since the last move began."""
+        return self.count != self._before
 
     def came(self, *, hard: bool) -> None:
         """Call this before the stop is sent. The stop is then counted in time, or sent after the move's command."""
@@ -43,13 +119,13 @@ class Stops:
         Raises:
             DeviceError: a stop came; it has been sent again.
         """
-        before, problem = self.count if since is None else since, None
+        self._before, problem = self.count if since is None else since, None
         try:
             yield
         except DeviceError as error:
             problem = error
         finally:
-            if came := self.count != before:
+            if came := self.came_since:
                 self._send(self._hard)
         if came:
             raise DeviceError(
@@ -118,26 +194,63 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
     )
 
 
-class LineStage(RotationStage, Protocol):
-    """A stage behind a serial line; its driver adds the commands of the controller.
+class LineStage(RotationStage):
+    """A stage behind a line; its driver adds the commands of the controller.
 
     `stop` returns when the stage stands, `abort` at once. A `wait` for a move that any thread stopped raises, so that
-    no thread takes the move as complete.
+    no thread takes the move as complete. Closing restores the settings that the driver has changed.
     """
 
-    _clock: Clock
-    _travel: Travel
-    _stops: Stops
+    _found: FoundSettings
+    """What opening and moves change in the controller, as it was found."""
 
+    def __init__(self, url: str, settings: Any, clock: Clock, name: str) -> None:
+        self.name, self._url, self._clock = name, url, clock
+        self._travel, self._stops = Travel(name, settings.limits()), Stops(name, self._send_stop)
+        self._target: int | None = None
+        self._searching = self._closed = False
+
+    @abstractmethod
     def _counts(self) -> int:
         """The present place, asked of the controller."""
 
+    @abstractmethod
     def _send_stop(self, hard: bool) -> str:
         """Send a stop (hard: without deceleration); returns the command."""
+
+    @abstractmethod
+    def _release(self) -> None:
+        """Restore settings, and close the line even if it is dead."""
+
+    @contextmanager
+    def _closed_on_failure(self) -> Iterator[None]:
+        """Context around the opening of the controller."""
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def _aim(self) -> str:
+        """Where the last move or search was to end; "" before the first."""
+        if self._searching:
+            return "its reference"
+        return "" if self._target is None else self._travel.degrees(self._target)
 
     @property
     def limits(self) -> StageLimits:
         return self._travel.limits
+
+    def keep_found_settings(self, store: SettingsStore) -> None:
+        """See `RestoresSettings`."""
+        self._found.keep_in(store)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            with suppress(DeviceError):  # a dead line is closed, too
+                self._release()
 
     def to_counts(self, angle: float) -> int:
         return self._travel.to_counts(angle)

@@ -90,6 +90,17 @@ class Travel:
             state="Nothing has moved",
         )
 
+    def native(self, speed: float, scale: float, most: int, unit: str) -> int:
+        """A speed (rad/s) in whole steps of the controller, of which a radian has `scale`.
+
+        Raises:
+            DeviceRefused: fewer than one of them, or more than `most`.
+        """
+        steps = round(speed * scale) if 0 < speed < 2 * self.limits.max_speed else 0
+        if not 1 <= steps <= most:
+            raise self.no_such_speed(speed, f"1 to {most} {unit}")
+        return steps
+
     def refuse_train(self, train: TriggerTrain) -> None:
         """Refuse a train without pulses or intervals, or beyond the soft limits.
 

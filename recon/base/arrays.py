@@ -1,4 +1,4 @@
-"""Types of arrays that signatures share, and the spread of values by their median."""
+"""Types of arrays that signatures share, the spread of values by their median, and binning of projections."""
 
 from __future__ import annotations
 
@@ -19,3 +19,28 @@ def median_deviation(values: NDArray[np.floating[Any]]) -> float:
     """Standard deviation of the normal distribution with this median of absolute values; 0 if none is finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
+
+
+def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    """Means of factor x factor line integrals [view, row, col]; trailing pixels that do not fill a bin are dropped.
+
+    Where line integrals differ within a bin, their mean is slightly larger than the line integral of the mean
+    transmission. The correction can bin counts instead (`--bin`).
+
+    Raises:
+        ValueError: for a factor below 1, or larger than the detector.
+    """
+    n, rows, cols = projections.shape
+    if not 1 <= factor <= min(rows, cols):
+        raise ValueError(f"bin factor must be between 1 and {min(rows, cols)} for {rows} x {cols} pixels, got {factor}")
+    if factor == 1:
+        return projections
+    rows, cols = rows // factor, cols // factor
+    whole = projections[:, : rows * factor, : cols * factor]
+    return whole.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)
+
+
+def factor_within(shape: tuple[int, int], voxels: int) -> int:
+    """Factor by which views [row, col] must be binned so that their volume has at most so many voxels."""
+    rows, cols = shape
+    return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= voxels), rows)

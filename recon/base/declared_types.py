@@ -10,11 +10,13 @@ import math
 import operator
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields
 from enum import Enum
 from functools import cache
 from numbers import Real
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,18 +38,61 @@ _WORDS: Mapping[Any, tuple[str, str]] = {
 """How one and how several of a type are called."""
 
 
+class Bound(NamedTuple):
+    """Range of a number that a field declares: `Annotated[int, Bound(1, 16)]`.
+
+    Attributes:
+        low, high: ends that belong to it; `high` is of whole numbers alone.
+        above: `low` itself does not belong to it.
+    """
+
+    low: int
+    high: float = math.inf
+    above: bool = False
+
+    def holds(self, value: Any, whole: bool) -> bool:
+        try:
+            number = operator.index(value) if whole else value
+            return not isinstance(value, bool) and self.low <= number <= self.high and (whole or self._inner(number))
+        except (TypeError, ValueError):  # text, a number that is not whole, or several
+            return False
+
+    def _inner(self, number: float) -> bool:
+        return number < math.inf and not (self.above and number == self.low)
+
+    def words(self, whole: bool) -> str:
+        if not whole:
+            return f"finite and above {self.low}" if self.above else f"finite and {self.low} or more"
+        ends = f"of {self.low} or more" if self.high == math.inf else f"from {self.low} to {self.high}"
+        return f"a whole number {ends}"
+
+
+Natural = Annotated[int, Bound(0)]
+Count = Annotated[int, Bound(1)]
+NonNegative = Annotated[float, Bound(0)]
+Positive = Annotated[float, Bound(0, above=True)]
+
+
 @cache
-def types_of(owner: Any) -> Mapping[str, Any]:
-    """The declared types of a dataclass's fields or a function's arguments, by name, where they can be resolved."""
-    resolved: dict[str, Any] = {}
+def _declared(owner: Any) -> tuple[Mapping[str, Any], Mapping[str, tuple[bool, Bound]]]:
+    """Types by name, where they can be resolved; bounds of those that have one, and whether it is of whole numbers."""
+    kinds, bounds = dict[str, Any](), dict[str, tuple[bool, Bound]]()
     for each in reversed(inspect.getmro(owner)) if isinstance(owner, type) else (owner,):
         for name, kind in inspect.get_annotations(each).items():
             one = type("_One", (), {"__annotations__": {name: kind}})
-            try:
-                resolved |= get_type_hints(one, vars(sys.modules[each.__module__]), {})
-            except NameError:  # a type that is imported for the type checker alone
-                resolved.pop(name, None)
-    return resolved
+            kinds.pop(name, None)
+            with suppress(NameError):  # a type that is imported for the type checker alone
+                full = get_type_hints(one, names := vars(sys.modules[each.__module__]), {}, include_extras=True)[name]
+                kinds |= get_type_hints(one, names, {})
+                for part in (full, *get_args(full)):
+                    if get_origin(part) is Annotated:
+                        bounds[name] = get_args(part)[0] is int, get_args(part)[1]
+    return kinds, bounds
+
+
+def types_of(owner: Any) -> Mapping[str, Any]:
+    """The declared types of a dataclass's fields or a function's arguments, by name, where they can be resolved."""
+    return _declared(owner)[0]
 
 
 def is_number(value: object) -> bool:
@@ -222,3 +267,42 @@ def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> 
     for name, value in values.items():
         if name in kinds and not is_of_type(value, kinds[name]):
             raise ValueError(refusal(name, value, kinds[name]))
+
+
+class Checked:
+    """A settings class, as a dataclass: its values are checked against what its fields declare."""
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+def check_settings(settings: Any) -> None:
+    """Raise ValueError for a value that a settings class does not take: of another type than its field declares, a name
+    that is not among those of a Literal, or a number beyond the field's `Bound`.
+
+    What is no number, such as None, has no bound where the field's type has it. An array without axes, as an .npz gives
+    a number, becomes the number.
+
+    Args:
+        settings: a dataclass.
+    """
+    owner: Any = type(settings)
+    declared, bounds = _declared(owner)
+    names = [each.name for each in fields(settings) if each.init]
+    for name in names:
+        value = getattr(settings, name)
+        if lone(value) and is_of_type(plain(value), declared.get(name, Any)):
+            object.__setattr__(settings, name, plain(value))
+    for name, (whole, bound) in bounds.items():
+        value, kind = getattr(settings, name), declared[name]
+        if (is_number(value) or _only_numbers(value, kind)) and not bound.holds(value, whole):
+            raise ValueError(f"{name} must be {bound.words(whole)}, got {shown(value)}")
+    for name in names:
+        kind = declared.get(name, Any)
+        if not is_of_type(value := getattr(settings, name), kind):
+            raise ValueError(refusal(name, value, kind))
+
+
+def _only_numbers(value: Any, kind: Any) -> bool:
+    """Whether the field's type lacks this value, which is no number, and has no more to offer than numbers and None."""
+    return not is_of_type(value, kind) and set(get_args(kind) or (kind,)) <= {int, float, NoneType}

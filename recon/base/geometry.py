@@ -34,10 +34,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F64
-from recon.base.declared_types import check_arguments
-from recon.base.picture import fan, html
+from recon.base.declared_types import check_arguments, check_settings
+from recon.base.greys import fan, html
 from recon.base.ray_width import NO_WIDTH, RayWidth
-from recon.base.settings_check import check_settings
 
 _OF_VIEWS = "angles", "shifts", "roll", "tilt", "centres"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
@@ -427,6 +426,12 @@ class Geometry:
             width=self.width.binned(factor),
             skew=self.skew * factor,
         )
+
+
+def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
+    """ValueError where the values are not [view, row, col] of a geometry's views."""
+    if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):
+        raise ValueError(f"{name} have shape {shape}, the geometry says {expected} [view, row, col]")
 
 
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:

@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Stop
+from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry
-from recon.base.picture import html, middle_slices
-from recon.base.settings_check import check_settings
-from recon.base.stop import Stop
+from recon.base.greys import html, middle_slices
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 Plain = str | int | float
@@ -66,7 +65,7 @@ def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Energies:
+class Energies(Checked):
     """The energy of each view, and the attenuation of the pure materials at these energies.
 
     Attributes:
@@ -77,12 +76,9 @@ class Energies:
     of_view: NDArray[np.intp]
     cross_sections: F64
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
 
 @dataclass(frozen=True, eq=False)
-class DataUse:
+class DataUse(Checked):
     """How the projections are used.
 
     Attributes:
@@ -103,12 +99,9 @@ class DataUse:
     times: F64 | None = None
     energies: Energies | None = None
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
 
 @dataclass(frozen=True, eq=False)
-class RunControl:
+class RunControl(Checked):
     """How a caller watches, ends and continues a reconstruction.
 
     Attributes:
@@ -131,9 +124,6 @@ class RunControl:
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
     @property
     def stop(self) -> Stop:
         """Asks whether the run should end with the volume so far."""
@@ -143,6 +133,16 @@ class RunControl:
     def stop_of_trials(self) -> Callable[[], bool]:
         """Asks whether the trials should end."""
         return self.stop_trials or self.stop
+
+    def tell(self, progress: Progress) -> None:
+        """Report the progress, where somebody listens."""
+        if self.on_progress is not None:
+            self.on_progress(progress)
+
+    def tell_part(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
+        """Report a part of the work, or the work of a direct method, that began at a time of the clock."""
+        if self.on_progress is not None:
+            self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
     def by(self, deadline: float) -> RunControl:
         """The same control with a deadline by its clock."""
@@ -251,11 +251,12 @@ class Traits:
         held_out: views can be held out.
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
-        budget: a time budget chooses its settings, see `recon.assess.plans`.
+        budget: a time budget chooses its settings, see `recon.assess.time_model`.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
-        in_time: it makes several volumes, at times of the scan, all at once in memory; it is a `JointMethod`.
+        in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, named
+            `volume_names` if they are of materials; `Reconstruction.series` has all.
         by_energy: likewise, of each material, from scans at several energies.
         own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
@@ -307,18 +308,6 @@ class Method(Protocol):
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory of `run` in bytes, without the projections, and without their weights if they are `weighted`."""
-
-
-class JointMethod(Method, Protocol):
-    """A method with the trait `in_time` or `by_energy`: `Reconstruction.series` has all of its volumes."""
-
-    @property
-    def volumes(self) -> int:
-        """Number of its volumes."""
-
-    @property
-    def volume_names(self) -> tuple[str, ...]:
-        """Names of the materials; empty if its volumes are of times."""
 
 
 @runtime_checkable

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from recon.base.settings_check import check_settings
+from recon.base.declared_types import Checked, NonNegative
 
 
 @dataclass(frozen=True)
-class RayWidth:
+class RayWidth(Checked):
     """Spread of a pixel's signal on the detector, and turn of the stage during the exposure; 0: a single ray.
 
     Attributes:
@@ -17,12 +17,9 @@ class RayWidth:
         arc: radians that the stage turns during an exposure; a view's angle is that of the middle of its exposure.
     """
 
-    pixel: float = 0.0
-    blur: float = 0.0
-    arc: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_settings(self, least=dict.fromkeys(("pixel", "blur", "arc"), 0.0))
+    pixel: NonNegative = 0.0
+    blur: NonNegative = 0.0
+    arc: NonNegative = 0.0
 
     def __bool__(self) -> bool:
         return self.variance > 0 or self.arc > 0

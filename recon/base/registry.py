@@ -11,11 +11,12 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import redirect_stdout
+from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pkgutil import iter_modules
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 _PREFIX = "splatline."
 _NEAR = 0.65  # of 1: from which likeness on a name may have been meant
@@ -153,3 +154,41 @@ def entry_points_announced() -> tuple[EntryPoint, ...]:
     """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
     found = entry_points()
     return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Numbers of iterations or steps that a comparison tries of a method.
+
+    Attributes:
+        setting: "iterations" or "steps".
+        quick, full: of a short and of a long comparison. The first one is the baseline, about which others vary.
+        chosen: the data choose a length by default, which is the baseline.
+    """
+
+    setting: Literal["iterations", "steps"]
+    quick: tuple[int, ...]
+    full: tuple[int, ...]
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
+class MethodEntry:
+    """Where the settings class of a method is, and when it is compared with others.
+
+    Attributes:
+        module, cls: of its settings class, see `recon.base.method.Method`.
+        streams: it has `stream`, so that its volume can grow while views arrive.
+        compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
+        emission: it is compared where the sample emits, whatever `compared` says.
+        several: what its volumes are of, where it makes several.
+        lengths: that a trade-off tries; None: the default.
+    """
+
+    module: str
+    cls: str
+    streams: bool = False
+    compared: bool = True
+    emission: bool = False
+    several: Literal["", "times", "materials"] = ""
+    lengths: Lengths | None = None

@@ -77,6 +77,14 @@ class Costs:
     choice: Work = field(default_factory=Work)
 
 
+class SizedRun(NamedTuple):
+    """An operation of some size: the two amounts of its work, and what does it."""
+
+    first: float
+    second: float
+    run: Callable[[], object]
+
+
 class Span(NamedTuple):
     """Shortest and longest expected time of a run, in s.
 

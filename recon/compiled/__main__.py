@@ -117,9 +117,9 @@ def _signatures(roots: Sequence[Path]) -> dict[tuple[str, str], set[Any]]:
     for module, name, content in packed:
         try:
             importlib.import_module(module)  # its types
-        except ImportError:
+            _, index = _read(content)
+        except (ImportError, AttributeError):  # a module or a type has another name now
             continue
-        _, index = _read(content)
         # tv._dual_step-94.py311.nbi, voxelize._filler.locals.kernel-155.py311.nbi
         kernel = name.partition(".")[2].rsplit("-", 1)[0].replace(".locals.", ".<locals>.")
         signatures[module, kernel].update(key[0] for key in index)

@@ -3,12 +3,112 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32
-from recon.post.clusters import k_means
+from recon.base.arrays import F32, F64
+
+_CLUSTERED = 20_000  # values from which centres are computed
+_STARTS = 8
+MOST = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """Grey values grouped by k-means.
+
+    Attributes:
+        centres: float64 [cluster], rising.
+        shares: of all values in each.
+        inertias: mean squared distance to the centres for 1, 2, ... clusters, if the elbow rule was used.
+    """
+
+    centres: F64
+    shares: F64
+    inertias: F64
+
+    @property
+    def threshold(self) -> float:
+        """Half-way between the brightest centre and the centre of the largest other cluster.
+
+        Clusters between those two are edges, mixtures of both; an edge lies half-way (ISO 50 % rule).
+        """
+        return float(self.centres[-1] + self.centres[:-1][self.shares[:-1].argmax()]) / 2
+
+
+def k_means(values: NDArray[np.floating], k: int, seed: int = 0) -> F64:
+    """Rising centres [k] of one-dimensional k-means (MacQueen 1967), the best of some starts by k-means++.
+
+    Raises:
+        ValueError: fewer than k different values, or values that are not finite.
+    """
+    return _fitted(_sampled(values, seed), k, seed)[0]
+
+
+def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) -> Clusters:
+    """Clusters of grey values; k None: as many as the elbow rule says, 2 to 5, see `elbow`.
+
+    Raises:
+        ValueError: as `k_means`, or for k below 2.
+    """
+    if k is not None and k < 2:
+        raise ValueError(f"at least 2 clusters are needed to tell particles from the rest, got {k}")
+    sample = _sampled(values, seed)
+    inertias = np.empty(0)
+    if k is None:
+        most = min(MOST, np.unique(sample).size)
+        inertias = np.array([_fitted(sample, n, seed)[1] for n in range(1, most + 1)])
+        k = elbow(inertias)
+    centres, _ = _fitted(sample, k, seed)
+    counts = np.bincount(np.searchsorted((centres[1:] + centres[:-1]) / 2, sample), minlength=k)
+    return Clusters(centres, counts / sample.size, inertias)
+
+
+def elbow(inertias: F64) -> int:
+    """The number of clusters at the elbow of the mean squared distances W for 1, 2, ... clusters; at least 2.
+
+    That is the sharpest bend of the logarithm log(W). The bend of W itself (Thorndike 1953) is at 2 for any number of
+    equal steps, because W falls as 1 / k² before it.
+    """
+    if inertias.size < 3:
+        return 2
+    fall = np.log(np.maximum(inertias, 1e-9 * inertias[0]))
+    return int(np.diff(fall, 2).argmax()) + 2
+
+
+def _sampled(values: NDArray[np.floating], seed: int) -> F64:
+    flat = np.asarray(values).ravel()
+    if flat.size > _CLUSTERED:
+        flat = np.random.default_rng(seed).choice(flat, _CLUSTERED, replace=False)
+    if not np.isfinite(flat).all():
+        raise ValueError("some grey values are not finite")
+    return flat.astype(np.float64)
+
+
+def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
+    """Centres, rising, and the mean squared distance to them."""
+    from scipy.cluster.vq import ClusterError, kmeans2
+
+    if np.unique(sample).size < k:
+        raise ValueError(f"{np.unique(sample).size} different grey values do not make {k} clusters")
+    best: tuple[F64, float] | None = None
+    rng = np.random.default_rng(seed)
+    for _ in range(_STARTS):
+        try:
+            centres = np.sort(kmeans2(sample[:, None], k, iter=30, minit="++", rng=rng, missing="raise")[0].ravel())
+        except ClusterError:  # a start may lose a cluster
+            continue
+        nearest = centres[np.searchsorted((centres[1:] + centres[:-1]) / 2, sample)]
+        inertia = float(np.mean((sample - nearest) ** 2))
+        if best is None or inertia < best[1]:
+            best = centres, inertia
+    if best is None:
+        raise ValueError(f"{k} clusters do not fit {sample.size} grey values from {sample.min():g} to {sample.max():g}")
+    return best
+
 
 Box = tuple[slice, slice, slice]
 

@@ -17,9 +17,9 @@ from scipy.ndimage import uniform_filter1d
 
 from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
-from recon.prep.axis_search import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
-from recon.prep.axis_search import AxisError as AxisError
-from recon.prep.axis_search import AxisEstimate as AxisEstimate
+from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
+from recon.prep.axis_wedge import AxisError as AxisError
+from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64

@@ -10,14 +10,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import Mask
-from recon.base.declared_types import check_arguments
+from recon.base.declared_types import check_arguments, check_settings
 from recon.base.masks import Image, fill, plan_fill
-from recon.base.settings_check import check_settings
-from recon.prep.air import air_columns, air_light, edge_depth, edge_profiles
 from recon.prep.counts import Photons, of_view
-from recon.prep.defects import dead_pixels, zingers
 from recon.prep.references import References as References
-from recon.prep.references import check, flat_at
+from recon.prep.references import (
+    air_columns,
+    air_light,
+    check,
+    dead_pixels,
+    edge_depth,
+    edge_profiles,
+    flat_at,
+    zingers,
+)
 
 
 class UnlitViewsError(ValueError):

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 from recon.prep.align import opposite_curves
-from recon.prep.axis_search import FEWEST_BANDS, FEWEST_COLS
-from recon.prep.axis_wedge import wedge_curves
+from recon.prep.axis_wedge import FEWEST_BANDS, FEWEST_COLS, wedge_curves
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

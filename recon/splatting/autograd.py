@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu, Pass
 

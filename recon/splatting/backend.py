@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
 from recon.kernels.cpu.adam import adam_all, add_lengths

@@ -20,7 +20,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import DEFAULT_STEPS, FEW_WILD, TRIAL_THRESHOLD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
+from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
@@ -28,10 +28,8 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.held_out import MOST_TRIALS, HeldOutTrial, beyond_chance, choose_weight
 from recon.voxels.iterative import Watch, prior_decisions, solve
-from recon.voxels.methods.pnp_dct import PnpDct, choose_patches, residuals_of_patches
-from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
-from recon.voxels.pnp_dct import TRIAL_STEPS, pnp_dct
+from recon.voxels.methods import PnpDct, choose_patches, residuals_of_patches
+from recon.voxels.priors import TRIAL_STEPS, NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector, projection_images, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -79,9 +77,7 @@ class _Watch:
         return self.sweep(number, of, "sweeps on voxels")
 
     def sweep(self, number: int, of: int, unit: str) -> bool:
-        if self._control.on_progress is not None:
-            nan, seconds = math.nan, self._control.now() - self._begin
-            self._control.on_progress(Progress(number, of, seconds, nan, nan, 0, self._n_views, unit=unit))
+        self._control.tell_part(number, of, self._begin, self._n_views, unit)
         return self.asked()
 
 

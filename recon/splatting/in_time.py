@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from typing import NamedTuple
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from recon.assess.time_model import Speeds
 from recon.base.geometry import Geometry
-from recon.base.method import Clock
+from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
-from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS
+from recon.base.work import CLOCK, Costs, Rates, Work
+from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS, finish
+from recon.splatting.fit_method import FitMethod, StreamingMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import sample_gaussians
+from recon.splatting.initialise import SCALED_BY, count_for, joined_for, sample_gaussians, start_method
+from recon.splatting.settings import FitSettings, growth
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
-from recon.voxels.methods.pnp_dct import PnpDct
-from recon.voxels.ordered_fista import subsets_of
+from recon.splatting.stream import StreamingFit
+from recon.voxels.direct import direct_work
+from recon.voxels.held_out import CHOICE_SWEEPS, LEAST_VIEWS, choice_sweeps
+from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.priors import TRIAL_STEPS, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
+from recon.voxels.work import fista_sweeps, patch_choice, patch_steps, power_rounds, trial_part, weight_choice
 
 FINISH_SHARE = 0.8
 """Largest share of the finish in the time after the first steps: it adds more than most steps before it."""
@@ -111,3 +120,188 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
         return FinishPlan(0, 0.0)
     sweeps = min(FINISH_SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else FINISH_SWEEPS
     return FinishPlan(sweeps, before + sweeps * sweep, trials)
+
+
+def _ignore(progress: Progress) -> None:
+    pass
+
+
+def planned_finish(method: FitMethod, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
+    """The finish of a method in its share of the remaining seconds, of which all steps take `steps`.
+
+    If the time suffices for two sweeps, the method's own number is used.
+    """
+    room, geometry = FINISH_SHARE * remaining, problem.geometry.at_row(0)
+    plan = finish_within(room, remaining - steps, geometry, problem.grid, now)
+    return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
+
+
+@dataclass(frozen=True, eq=False)
+class LastRound:
+    """The last round of a fit, over the views that it has learnt already, and the sweeps after it.
+
+    Attributes:
+        fit: holds the line integrals of the problem that it is run on, in the same order.
+        method: that began the fit.
+        seconds: for the round and the sweeps, at most.
+        began: when the fit began to wait for views, by the clock of the run; `Progress.seconds` count from there.
+        before: the progress of the fit until now.
+        on_progress: is told of each progress of the round, too, while the fit can be looked at.
+    """
+
+    fit: StreamingFit
+    method: StreamingMethod
+    seconds: float
+    began: float
+    before: Sequence[Progress] = ()
+    on_progress: Callable[[Progress], None] = _ignore
+
+    name: ClassVar[str] = "the last round"
+    label: ClassVar[str] = "Last round of a fit whose views came one by one"
+    traits: ClassVar[Traits] = Traits()
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        """The volume, marked with the name of the method that began it.
+
+        Raises:
+            ValueError: no view has arrived, or the views hold no matter.
+        """
+        begin, stop = control.now(), control.stop
+        end, history = begin + self.seconds, list(self.before)
+        plan = FinishPlan(0, 0.0)
+        if self.method.finish_sweeps:
+            round_seconds = self.fit.last_steps * self.fit.step_seconds
+            plan = planned_finish(self.method, self.seconds, round_seconds, problem, control.now)
+
+        def tell(progress: Progress) -> None:
+            progress = replace(progress, seconds=control.now() - self.began)
+            history.append(progress)
+            control.tell(progress)
+
+        def on_progress(progress: Progress) -> bool:
+            tell(progress)
+            self.on_progress(progress)
+            return stop()
+
+        tell(self.fit.finish(max(end - plan.seconds - control.now(), 0.0), on_progress))
+        volume, gaussians, reached, sweeps = self.fit.snapshot(), self.fit.gaussians, history[-1], 0
+        if plan.sweeps != 0 and gaussians is not None and not stop():
+            late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
+            volume, sweeps = finish(volume, gaussians, problem, plan.sweeps, self.fit.settings, late)
+        # The end cuts steps with patches, which no number of sweeps tells.
+        finished = plan.sweeps == self.method.finish and (sweeps == plan.sweeps or control.now() < end)
+        if not ((finished and reached.step >= reached.steps) or stop.stopped):
+            warnings.warn(
+                f"{self.seconds:g} s did not suffice for the last round: {reached.step} of {reached.steps} steps, and "
+                f"{'a whole' if finished else 'a shorter' if sweeps else 'no'} finish on voxels. "
+                "A reconstruction of the finished scan leaves nothing out",
+                stacklevel=2,
+            )
+        settings = {
+            **asdict(self.fit.settings),
+            "finish": sweeps,
+            "seconds_after_scan": control.now() - begin,
+            "gaussians": reached.n_gaussians,
+        }
+        seconds = control.now() - self.began
+        return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)
+
+    def toy(self) -> Self:
+        """The same: its kernels were compiled when the fit began."""
+        return self
+
+    def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
+        """Most bytes beside the projections: as the method that began the fit."""
+        return self.method.memory(geometry, grid, weighted)
+
+
+_RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back for the gradient
+
+
+def covered(voxels: float, gaussians: float) -> float:
+    """In proportion to the pixels that Gaussians cover in a view, whose widths are their distances."""
+    return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
+
+
+def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
+    """The work of `train.run_fit`."""
+    if method.planned_steps is None:
+        return Costs({method.name: Work.of(CLOCK, method.seconds or 0.0)})
+    weight, patches = weight_choice(geometry, grid), patch_choice(geometry, grid)
+    fit = _fit(method, geometry, grid, method.planned_steps)
+    if not method.by_content or geometry.n_views < LEAST_VIEWS:
+        if method.finish_sweeps == 0:
+            return Costs({method.name: fit})
+        choice = weight + patches if method.finish is None else weight
+        return Costs({method.name: fit + _finish(method, geometry, grid)}, choice)
+    short = _fit(method, geometry, grid, method.least_steps or 0)
+    volumes = {method.name: fit + _finish(method, geometry, grid)}
+    for other in (FistaTv(), PnpDct()):
+        volumes[other.name] = short + other.costs(geometry, grid).volumes[other.name]
+    trial = Work()
+    if (part := trial_part(geometry, grid)) is not None:
+        share = part[0].detector_shape[0] / geometry.detector_shape[0]
+        own = method.for_trial(share, FIRST_SHARE)
+        refined = fista_sweeps(*part, FINISH_SWEEPS, SUBSETS, TV_STEPS) + patch_steps(*part, TRIAL_STEPS)
+        trial = _fit(own, *part, own.planned_steps or 0) + refined + _rendered(own, *part)
+    return Costs(volumes, weight + patches + trial)
+
+
+def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
+    """From the first volume to that of the Gaussians."""
+    cone = geometry.is_cone
+    field = Grid.for_fit(geometry, grid)
+    voxels, usual = math.prod(field.shape), count_for(field, cone)
+    given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
+    count = given or usual
+    joined = method.fit.joined_pixels or joined_for(field, cone, max(count, usual), geometry.detector_shape)
+    first = start_method(geometry, method.start)
+    start = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
+    rays = geometry.n_views * math.prod(geometry.detector_shape) / joined**2
+    start = start * (1 / joined**3) + Work.of("draw", count, voxels / joined**3)
+    start += Work.of("views", geometry.n_views, rays)
+    views = steps * method.fit.views_per_step + _RENDER * SCALED_BY
+    grown = count * (1 + growth(method.fit)) / 2
+    fill = Work.of("fill", grown, math.prod(grid.shape))
+    return start + views * _view(method, geometry, voxels / joined**3, grown) + fill
+
+
+def _view(method: FitMethod, geometry: Geometry, voxels: float, gaussians: float) -> Work:
+    """A view of a step of a fit."""
+    reach = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
+    return Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, gaussians) * reach**2)
+
+
+def _rendered(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
+    """All views of the Gaussians, and once more of what no voxels explain."""
+    field = Grid.for_fit(geometry, grid)
+    count = method.gaussians if isinstance(method.gaussians, int) else count_for(field, geometry.is_cone)
+    return 2 * _RENDER * geometry.n_views * _view(method, geometry, math.prod(field.shape), count)
+
+
+def _finish(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
+    """The refinement on voxels, with steps of sparse patches where these may follow."""
+    refined = power_rounds(geometry, grid, subsets_of(geometry, SUBSETS)) + _rendered(method, geometry, grid)
+    refined += fista_sweeps(geometry, grid, method.finish_sweeps, SUBSETS, TV_STEPS)
+    if method.finish is not None:
+        return refined
+    return refined + patch_steps(geometry, grid, PnpDct().iterations)
+
+
+def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
+    """Seconds of each part of a reconstruction on this machine; `recon.assess.time_model` chooses by them."""
+    field = Grid.for_fit(geometry, grid)
+    voxels, count = math.prod(field.shape), count_for(field, geometry.is_cone)
+    view = Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, count))
+    first = start_method(geometry, "fbp")
+    volume = direct_work(geometry, field) if first is None else first.costs(geometry, field).volumes[first.name]
+    start = Work.of("draw", count, voxels) + _RENDER * SCALED_BY * view
+    try:
+        sweep = fista_sweeps(geometry, grid, 1, SUBSETS, TV_STEPS).seconds(rates)
+        trials = weight_choice(geometry, grid).seconds(rates) if geometry.n_views >= LEAST_VIEWS else 0.0
+    except ValueError:  # voxels do not take these views
+        sweep, trials = math.inf, 0.0
+    step, fill = FitSettings().views_per_step * view, Work.of("fill", count, math.prod(grid.shape))
+    return Speeds(
+        volume.seconds(rates), start.seconds(rates), step.seconds(rates), fill.seconds(rates), sweep, trials
+    )  # fmt: skip

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 
-from recon.base.binning import bin_views
+from recon.base.arrays import bin_views
 from recon.base.choices import Filter
 from recon.base.choices import Start as Start
 from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
-from recon.base.ray_model import RayModel
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.tv import total_variation
@@ -27,10 +26,10 @@ from recon.splatting.splat import project
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.iterative import solve
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import Projector, volume_lines
-from recon.voxels.tv import difference_weights
 from recon.voxels.view_weights import angular_weights
+from recon.voxels.voxel_problem import difference_weights
 
 START_SWEEPS = 10
 """Of these sweeps; with momentum, more fit the noise. Without: not measured."""

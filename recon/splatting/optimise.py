@@ -16,11 +16,10 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.engine import Active
 from recon.kernels.fused_step import FusedStep, StepInputs, StepModel, StepPlan
 from recon.splatting.backend import Backend, Cpu, Pass
-from recon.splatting.density_control import DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import morton_order
 from recon.splatting.problem import FitProblem, make_problem
-from recon.splatting.settings import NAMES, FitSettings, tv_size, tv_weight
+from recon.splatting.settings import NAMES, DensityPolicy, FitSettings, control, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
 
 NORMALISE = 100  # steps between two normalisations of the quaternions

@@ -8,10 +8,9 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, bin_views
 from recon.base.choices import Loss as Loss
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
@@ -89,9 +88,7 @@ def make_problem(
     Raises:
         ValueError: where shapes disagree, a view has no value that can be used, or the loss is unknown.
     """
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if projections.shape != expected:
-        raise ValueError(f"projections have shape {projections.shape}, the geometry says {expected}")
+    require_views(geometry, projections)
     if loss not in _KINDS:
         raise ValueError(f"loss must be one of {get_args(Loss)}, got {loss!r}")
     half_field = max(n * edge for n, edge in zip(grid.shape, grid.spacing, strict=True)) / 2

@@ -9,32 +9,31 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from recon.assess.plans import MODEL_STEPS, PRESETS, best_steps
+from recon.assess.time_model import MODEL_STEPS, PRESETS, best_steps
 from recon.base.arrays import F32
 from recon.base.choices import Quality
+from recon.base.declared_types import Checked, Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 from recon.base.work import Costs
 from recon.splatting.anytime import while_views_come
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.in_time import fit_costs
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.settings import FitSettings, growth
+from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
-from recon.splatting.work import fit_costs
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import PnpDct
 from recon.voxels.voxel_problem import iterative_memory
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
 
 @dataclass(frozen=True, eq=False)
-class R2:
+class R2(Checked):
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
@@ -69,17 +68,14 @@ class R2:
         error_bars=(2.2, 0.1),
     )
 
-    steps: int | None = None
-    seconds: float | None = None
-    gaussians: int | Gaussians | None = None
+    steps: Natural | None = None
+    seconds: NonNegative | None = None
+    gaussians: Count | Gaussians | None = None
     start: Start = "fbp"
     early_stop: bool = False
-    finish: int | None = None
+    finish: Natural | None = None
     allow_negative: bool = False
     fit: FitSettings = field(default_factory=FitSettings)
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"steps": 0, "gaussians": 1, "finish": 0}, least={"seconds": 0.0})
 
     @property
     def planned_steps(self) -> int | None:

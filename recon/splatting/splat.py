@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.backend import Backend, Cpu
 from recon.splatting.gaussians import Gaussians, turned_by_rows

@@ -5,7 +5,7 @@ anew when the views have grown by half: from the model's volume and an FBP of it
 stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
 clones and splits them where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any
 number of steps to come (`anytime`). The first step after its arrival learns a view. Every third other step takes one of
-the newest views, the rest replay all views evenly (`arrivals`). One view of sixteen is held out until the last round.
+the newest views, the rest replay all views evenly (`anytime`). One view of sixteen is held out until the last round.
 """
 
 from __future__ import annotations
@@ -24,9 +24,21 @@ from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
-from recon.splatting import arrivals
 from recon.splatting import optimise as fit
-from recon.splatting.anytime import HALF, WHILE_VIEWS_COME, average, averaged, fallen
+from recon.splatting.anytime import (
+    HALF,
+    WHILE_VIEWS_COME,
+    BetterVolume,
+    PredictionErrors,
+    average,
+    averaged,
+    checked_views,
+    covered_angle,
+    fallen,
+    is_held_out,
+    next_view,
+    shift_with_axis,
+)
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import (
     default_count,
@@ -37,7 +49,6 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-from recon.splatting.shown import BetterVolume, PredictionErrors
 from recon.voxels.field_edges import wider_than_field
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
@@ -132,12 +143,12 @@ class StreamingFit:
         """
         check_arguments(StreamingFit.add_views, locals())
         theta = np.atleast_1d(np.asarray(angles, np.float64))
-        images = arrivals.checked(data, theta, self._template.detector_shape)
+        images = checked_views(data, theta, self._template.detector_shape)
         if self._problem is None:
             self._data.extend(images)
         else:
             self._problem = extend(self._problem, images, theta)
-        self._held_out += [arrivals.held_out(self._arrived + k) for k in range(theta.size)]
+        self._held_out += [is_held_out(self._arrived + k) for k in range(theta.size)]
         self._arrived += theta.size
         self._angles.extend(theta.tolist())
         if self._state is not None and theta.size:
@@ -174,7 +185,7 @@ class StreamingFit:
         theta = np.asarray(self._angles)[which]
         if theta.size == 0:
             raise ValueError("there are no views to replace, or none would be left")
-        images = arrivals.checked(data, theta, self._template.detector_shape)
+        images = checked_views(data, theta, self._template.detector_shape)
         self._angles, self._held_out = theta.tolist(), [self._held_out[view] for view in which]
         if self._problem is None or self._state is None or self._others(images, which):
             self._data, self._problem, self._state = list(images), None, None
@@ -205,7 +216,7 @@ class StreamingFit:
         if not self._angles:
             raise ValueError("there is no view to replace")
         theta = np.asarray(self._angles)
-        images = arrivals.checked(np.asarray(data)[None], theta[-1:], self._template.detector_shape)
+        images = checked_views(np.asarray(data)[None], theta[-1:], self._template.detector_shape)
         if self._problem is None:
             self._data[-1:] = images
             return
@@ -227,7 +238,7 @@ class StreamingFit:
             return
         self._problem = replace(self._problem, geometry=replace(self._problem.geometry, axis_col=float(axis_col)))
         theta = self._problem.geometry.angles
-        shift = arrivals.shift_with_axis(theta, moved * self._template.sample_pitch)
+        shift = shift_with_axis(theta, moved * self._template.sample_pitch)
         for parameters in (self._state.parameters, self._state.mean):
             if parameters is not None:
                 parameters["means"][:, :2] -= shift
@@ -254,7 +265,7 @@ class StreamingFit:
         """The first view of the next step; None: any in turn, but for those held out, which the last round takes."""
         if len(state.drawn) < self._settings.views_per_step:
             state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not self._held_out[view]]
-        view = self._unseen.pop(0) if self._unseen else arrivals.chosen(self.n_views, self._rng)
+        view = self._unseen.pop(0) if self._unseen else next_view(self.n_views, self._rng)
         return None if view is None or self._held_out[view] else view
 
     @property
@@ -331,7 +342,7 @@ class StreamingFit:
     def _begin_round(self, force: bool = False) -> None:
         theta = np.asarray(self._angles)
         if self._state is None:
-            if not force and (theta.size < self._first_views or arrivals.span(theta) < self._first_span):
+            if not force and (theta.size < self._first_views or covered_angle(theta) < self._first_span):
                 return
             try:
                 self._place_first(all_views=force)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.plans import MODEL_STEPS, best_steps
+from recon.assess.time_model import MODEL_STEPS, best_steps
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -28,12 +28,11 @@ from recon.splatting.finish import Candidates, finish, judged
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
-    FINISH_SHARE,
     FinishPlan,
     fill_seconds,
-    finish_within,
     first_draw_seconds,
     first_sweep_seconds,
+    planned_finish,
 )
 from recon.splatting.initialise import (
     FirstVolume,
@@ -48,10 +47,10 @@ from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
 from recon.voxels.field_edges import wider_than_field
+from recon.voxels.held_out import unseen_residuals
 from recon.voxels.iterative import UNITS
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
-from recon.voxels.projector import data_residual
+from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.projector import Projector, projection_lines
 
 _ON_VOXELS = FistaTv, PnpDct  # candidates that a fit is compared with, the simpler one first
 _DECIDED = "candidate", UNITS, "weight", "strength"  # decisions that a checkpoint keeps
@@ -246,8 +245,7 @@ class _Run:
                 self.views.seen.n_views, self.tracker.value,
             )
         )  # fmt: skip
-        if self.control.on_progress is not None:
-            self.control.on_progress(self.history[-1])
+        self.control.tell(self.history[-1])
 
     def checkpoint(self, state: FitState) -> dict[str, NDArray[Any]]:
         return arrays_of(state, self.fitting.backend) | self.tracker.arrays() | decisions_of(self.decide.made, _DECIDED)
@@ -399,7 +397,7 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
     )  # fmt: skip
     if kept_back.size:
         views = run.views.all_geometry.select(kept_back)
-        if _worse(finished, volume, run.views.data[kept_back], views):
+        if _predicts_worse(finished, volume, run.views.data[kept_back], views):
             return volume, 0
     return finished, sweeps
 
@@ -430,17 +428,18 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
 
 
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
-    """The sweeps of the finish and their seconds, if `left` seconds remain after first steps of `step` seconds each.
-    `finish_within` gives the sweeps; if the time suffices for two, the method's own number is used."""
-    method, room = run.method, FINISH_SHARE * remaining
-    geometry = run.views.fitted.geometry.at_row(0)
-    plan = finish_within(room, remaining - best_steps(method.name) * step, geometry, run.problem.grid, run.control.now)
-    return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
+    """The plan of the finish, if so many seconds remain after first steps of `step` seconds each."""
+    return planned_finish(run.method, remaining, best_steps(run.method.name) * step, run.views.fitted, run.control.now)
 
 
-def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
-    """Whether the finished volume explains the views held out worse than the fit's, by more than 0.1 dB."""
-    return data_residual(finished, unseen, views) > 10 ** (0.1 / 20) * data_residual(fitted, unseen, views)
+def _predicts_worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
+    """Whether the finished volume leaves more of the views held out than the fit's, by more than 0.1 dB."""
+    projector, lines = Projector(views, fitted.grid), projection_lines(unseen)
+    after, before = (
+        np.square(unseen_residuals(projection_lines(projector.forward(volume.data)), lines, None, projector.resolution))
+        for volume in (finished, fitted)
+    )
+    return bool(after.mean() > 10 ** (0.1 / 10) * before.mean())
 
 
 def _usual(weights: F32, data: F32) -> float:

@@ -6,34 +6,178 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numba import njit, prange
+from numpy.typing import NDArray
 from scipy import fft
 
 from recon.base.arrays import F32, F64
-from recon.base.geometry import Geometry
+from recon.base.declared_types import Checked
+from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
+from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid, Volume
 from recon.base.work import Costs, Work
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.back_project import SLICES, nanoseconds
-from recon.voxels.fbp import Filter, fbp, fbp_memory, ramp
-from recon.voxels.fdk import fdk, refuse_climbing
+from recon.voxels.fbp import Filter, fbp, fbp_memory, filter_projections, ramp
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
 _f = np.float32
-_SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 _SAMPLES = 4  # samples of a projector that take as long as a voxel in a view
+SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 
 
 @njit(**OPTIONS)
-def _back_project(
+def _along_columns(
+    filtered: F32, cosines: F64, sines: F64, col0: F64, row0: F64, sod: float, sdd: float, pitch: float,
+    x: F64, y: F64, z: F64, out: F32,
+) -> None:  # fmt: skip
+    """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth."""
+    views, cols, rows = filtered.shape[0], filtered.shape[1] - 2, filtered.shape[2] - 2
+    nx, ny, nz = x.size, y.size, z.size
+    step = (z[1] - z[0]) if nz > 1 else 1.0
+    for j in prange(ny):
+        line = np.zeros(rows + 4, np.float32)
+        for v in range(views):
+            c, s = cosines[v], sines[v]
+            for i in range(nx):
+                depth = sod - x[i] * s + y[j] * c
+                magnify = sdd / (depth * pitch)
+                col = (x[i] * c + y[j] * s) * magnify + col0[v] + 1.0
+                if not (col >= 0.5 and col <= cols + 0.5):
+                    continue
+                low = math.floor(col)
+                part = _f(col - low)
+                share = _f((sod / depth) ** 2)
+                climb = step * magnify
+                base = z[0] * magnify + row0[v] + 1.0
+                first = math.ceil(max((0.5 - base) / climb, 0.0))
+                end = math.floor(min((rows + 0.5 - base) / climb, nz - 1.0)) + 1
+                if end <= first:
+                    continue
+                a, b = filtered[v, low], filtered[v, low + 1]
+                r0 = max(0, math.floor(base + climb * first) - 1)
+                r1 = min(rows + 2, math.ceil(base + climb * (end - 1)) + 2)
+                for row in range(r0, r1):
+                    line[row] = share * (a[row] + part * (b[row] - a[row]))
+                target = out[j, i, first:end]
+                base += climb * first
+                for k in range(end - first):
+                    row = base + climb * k
+                    whole = np.uint32(row)
+                    rest = _f(row - whole)
+                    target[k] += line[whole] + rest * (line[whole + np.uint32(1)] - line[whole])
+
+
+def fdk(
+    projections: NDArray[np.float32],
+    geometry: Geometry,
+    grid: Grid | None = None,
+    filter: Filter = "ram-lak",
+    on_block: Callable[[int, int], None] = lambda done, of: None,
+) -> NDArray[np.float32]:
+    """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
+
+    Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
+    interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
+    both (see `fan_shares`). A short scan, of 180 degrees and the fan's angle or more, must see it in every view (see
+    `cone_weights`). Matter that views cut off brightens the rim. A voxel that a view does not see gets nothing from it.
+
+    Args:
+        projections: float32 [view, row, col], line integrals (dimensionless).
+        geometry: a cone, straight (no roll, no tilt); views may be shifted.
+        grid: of the volume; None: `Grid.matching(geometry)`.
+        filter: "ram-lak", "shepp-logan" or "hann".
+        on_block: told how many of how many layers are done, counted by their views.
+
+    Returns:
+        float32 [z, y, x], 1/mm.
+
+    Raises:
+        ValueError: for a parallel beam, rolled or tilted views, too short a scan, an unknown filter. Also for a shape
+            that does not belong to the geometry, values that are not finite, or a box that reaches the source.
+    """
+    grid = Grid.matching(geometry) if grid is None else grid
+    if not geometry.is_cone:
+        raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
+    if not geometry.is_straight:
+        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
+    return _by_slabs(
+        projections, geometry, grid, cone_weights, partial(_prepared_views, filter=filter), _along_columns, on_block
+    )
+
+
+Prepare = Callable[[F32, Geometry, F64, tuple[int, int]], tuple[F32, tuple[Any, ...]]]
+"""Some views, weighed and filtered, by their geometry, the weights of their rays and columns of zeros beside them; and
+what a kernel takes of the views before the voxels."""
+
+
+def _by_slabs(
+    projections: F32, geometry: Geometry, grid: Grid, weights_of: Callable[[Geometry], tuple[F64, tuple[int, int]]],
+    prepare: Prepare,
+    kernel: Callable[..., None],
+    on_block: Callable[[int, int], None],
+) -> F32:  # fmt: skip
+    """Back-project views [view, row, col], some at a time, to [z, y, x].
+
+    Raises:
+        ValueError: a shape that does not belong to the geometry, views that climb, a box that reaches the source, or
+            values that are not finite.
+    """
+    require_views(geometry, projections)
+    if geometry.climbs:  # each voxel would miss the views that do not see it
+        raise ValueError(
+            f"views climb by {np.ptp(geometry.shifts[:, 1]):.4g} of {geometry.detector_shape[0]} rows. Direct methods "
+            "have weights for that in straight views of a parallel beam only: use an iterative method (fista-tv, sirt)"
+        )
+    if (reach := float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))) >= geometry.sod:
+        raise ValueError(
+            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
+        )
+    weights, zeros = weights_of(geometry)
+    z, y, x = grid.coordinates()
+    volume = np.zeros((y.size, x.size, z.size), np.float32)
+    slab = max(1, SLAB_BYTES // (4 * math.prod(geometry.detector_shape)))
+    for start in range(0, geometry.n_views, slab):
+        some = slice(start, start + slab)
+        part = geometry.select(some)
+        prepared, of_views = prepare(projections[some], part, weights[some], zeros)
+        if not np.isfinite(prepared).all():
+            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
+        for layers in calls(y.size, _SAMPLES * part.n_views * x.size * z.size):
+            lines = slice(layers.start, layers.stop)
+            kernel(prepared, *of_views, x, y[lines], z, volume[lines])
+            on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
+    return volume_slices(volume)
+
+
+def _prepared_views(
+    views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter
+) -> tuple[F32, tuple[Any, ...]]:
+    """Views times the weights [view, col] and the cosine of each ray, filtered. Columns of zeros stand before and
+    after. Shape [view, col + 2, row + 2], the rim twice."""
+    rows, cols = geometry.detector_shape
+    out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
+    for view in range(geometry.n_views):
+        col0, row0 = geometry.origin(view)
+        u = (np.arange(cols) - col0) * geometry.pixel_pitch
+        v = (np.arange(rows) - row0) * geometry.pixel_pitch
+        cosine = geometry.sdd / np.sqrt(geometry.sdd**2 + u**2 + v[:, None] ** 2)
+        # The ramp is that of a detector at the rotation axis.
+        weighed = np.pad((views[view] * (weights[view] * cosine)).astype(np.float32), ((0, 0), beyond))
+        out[view] = np.pad(filter_projections(weighed, geometry.sample_pitch, filter).T, 1, mode="edge")
+    origin = geometry.axis_col + geometry.shifts[:, 0] + beyond[0], geometry.axis_row + geometry.shifts[:, 1]
+    turn = np.cos(geometry.angles), np.sin(geometry.angles)
+    return out, (*turn, *origin, geometry.sod, geometry.sdd, geometry.pixel_pitch)
+
+
+@njit(**OPTIONS)
+def _along_rays(
     filtered: F32, axes: F64, origins: F64, sod: float, sdd: float, pitch: float, x: F64, y: F64, z: F64, out: F32
 ) -> None:  # fmt: skip
     """out[y, x, z] += Σ_view (sod / w)² filtered[view, col, row] bilinearly; lengths in mm, w the voxel's depth.
@@ -80,42 +224,25 @@ def posed_direct(
 
     Weights of columns that are measured twice count rolled and tilted views as straight ones.
     """
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if projections.shape != expected:
-        raise ValueError(
-            f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
-        )
-    refuse_climbing(geometry)
     if geometry.centres.any():
         raise ValueError(
             "the sources of these views lie on no circle about the axis, which filtered back-projection needs. Take an "
             "iterative method or r2"
         )
-    reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
-    if reach >= geometry.sod:
-        raise ValueError(
-            f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
-        )
-    weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
-    weights = weights * np.cos(geometry.tilt)[:, None]
-    z, y, x = grid.coordinates()
-    rows, cols = geometry.detector_shape
-    volume = np.zeros((y.size, x.size, z.size), np.float32)
-    slab = max(1, _SLAB_BYTES // (4 * rows * cols))
-    for start in range(0, geometry.n_views, slab):
-        some = range(start, min(start + slab, geometry.n_views))
-        prepared = np.stack([_prepared(projections[v], geometry, v, weights[v], zeros, filter) for v in some])
-        if not np.isfinite(prepared).all():
-            raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        axes = np.stack([geometry.axes(v) for v in some])
-        origins = np.array([geometry.origin(v) for v in some])
+
+    def weights_of(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
+        weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
+        return weights * np.cos(geometry.tilt)[:, None], zeros
+
+    def prepare(views: F32, part: Geometry, weights: F64, zeros: tuple[int, int]) -> tuple[F32, tuple[Any, ...]]:
+        each = range(part.n_views)
+        prepared = np.stack([_prepared(views[v], part, v, weights[v], zeros, filter) for v in each])
+        origins = np.array([part.origin(v) for v in each])
         origins[:, 0] += zeros[0]
-        sod, sdd = (geometry.sod, geometry.sdd) if geometry.is_cone else (0.0, 0.0)
-        for part in calls(y.size, _SAMPLES * len(some) * x.size * z.size):
-            lines = slice(part.start, part.stop)
-            _back_project(prepared, axes, origins, sod, sdd, geometry.pixel_pitch, x, y[lines], z, volume[lines])
-            on_block((start * y.size + len(some) * part.stop) // geometry.n_views, y.size)
-    return volume_slices(volume)
+        distances = (part.sod, part.sdd) if part.is_cone else (0.0, 0.0)
+        return prepared, (np.stack([part.axes(v) for v in each]), origins, *distances, part.pixel_pitch)
+
+    return _by_slabs(projections, geometry, grid, weights_of, prepare, _along_rays, on_block)
 
 
 def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tuple[int, int], filter: Filter) -> F32:
@@ -138,7 +265,7 @@ def _prepared(image: F32, geometry: Geometry, view: int, weights: F64, zeros: tu
 
 
 @dataclass(frozen=True)
-class Fbp:
+class Fbp(Checked):
     """Filtered back-projection (FDK for a cone).
 
     Attributes:
@@ -151,17 +278,12 @@ class Fbp:
 
     filter: Filter = "hann"
 
-    def __post_init__(self) -> None:
-        check_settings(self)
-
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         filled = masked(problem.projections, problem.use.weights)[0]
         begin, views = control.now(), problem.geometry.n_views
 
         def progress(done: int, slices: int) -> None:
-            if control.on_progress is not None:
-                nan = math.nan
-                control.on_progress(Progress(done, slices, control.now() - begin, nan, nan, 0, views, unit="slices"))
+            control.tell_part(done, slices, begin, views, "slices")
 
         data = direct(filled, problem.geometry, problem.grid, self.filter, progress)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})

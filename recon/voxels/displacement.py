@@ -21,7 +21,7 @@ from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.iterative import Watch, solve
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import OsSirtTv
 from recon.voxels.projector import Projector, seen_rays
 
 F32 = NDArray[np.float32]

@@ -19,8 +19,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
 from recon.voxels.held_out import busiest_rows
 from recon.voxels.iterative import solve
-from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 

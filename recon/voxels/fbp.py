@@ -20,10 +20,9 @@ from scipy import fft
 
 from recon.base.arrays import F32, F64
 from recon.base.choices import Filter as Filter
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, require_views
 from recon.base.registry import unknown
-from recon.base.slabs import bands_of, slices_of
-from recon.base.volume import Grid
+from recon.base.volume import Grid, bands_of, slices_of
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, ray_by_ray
 from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
@@ -302,11 +301,7 @@ def fbp(
         ValueError: the shape does not fit the geometry, values are not finite, the filter is unknown, or the geometry
         is a cone, rolled or tilted.
     """
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if projections.shape != expected:
-        raise ValueError(
-            f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
-        )
+    require_views(geometry, projections)
     grid = Grid.matching(geometry) if grid is None else grid
     if out is None:
         out = np.empty(grid.shape, np.float32)

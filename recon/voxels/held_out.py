@@ -21,12 +21,10 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import ENOUGH_MATTER, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
-from recon.voxels.sweeps import whitened
-from recon.voxels.voxel_problem import VoxelProblem
+from recon.voxels.voxel_problem import VoxelProblem, whitened
 
 TRIAL_SWEEPS = 16
 """Sweeps of total variation. Without, after 8, a weight twice as heavy seems best: -0.8 to -2.9 dB on a teapot."""

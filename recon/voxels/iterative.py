@@ -10,15 +10,18 @@ in other units sums of their squares could exceed the range of float32.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
+from recon.base.declared_types import Checked, Count
+from recon.base.geometry import require_views
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
 from recon.base.volume import Grid, Volume
@@ -35,29 +38,13 @@ _SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait
 
 @runtime_checkable
 class IterativeMethod(Protocol):
-    """An iterative method on voxels, such as `recon.features.iterative.sirt.Sirt`."""
+    """An iterative method on voxels, such as `recon.features.iterative.methods.Sirt`."""
 
     @property
     def iterations(self) -> int: ...
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-
-
-@runtime_checkable
-class PreparedMethod(IterativeMethod, Protocol):
-    """An iterative method that makes its first volume by sweeps over the views, which it counts before iterations."""
-
-    @property
-    def first_sweeps(self) -> int: ...
-
-
-@runtime_checkable
-class ChoosingPrior(IterativeMethod, Protocol):
-    """An iterative method whose trials choose its prior; `trial_sweeps`: those of all trials, as a rule."""
-
-    @property
-    def trial_sweeps(self) -> int: ...
 
 
 def _silent(*_: object) -> bool:
@@ -137,43 +124,59 @@ def solve(
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
 
 
-def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
-    """`Method.run` of an iterative method, whose settings are a dataclass.
+@dataclass(frozen=True)
+class VoxelMethod(Checked, ABC):
+    """A method whose iterations improve a volume of voxels; a subclass adds its settings.
 
-    Raises:
-        ValueError: as `solve`.
+    Attributes:
+        first_sweeps: over the views, for the first volume; they are counted before the iterations.
+        trial_sweeps: those of all trials that choose its prior, as a rule.
     """
-    begin, geometry = control.now(), problem.geometry
-    history: list[Progress] = []
-    planned = method.iterations + (method.first_sweeps if isinstance(method, PreparedMethod) else 0)
 
-    trials, trial = method.trial_sweeps if isinstance(method, ChoosingPrior) else 0, 0
+    first_sweeps: ClassVar[int] = 0
+    iterations: Count
 
-    def on_trial() -> bool:
-        nonlocal trial
-        trial += 1
-        if control.on_progress is not None:
-            nan, (of, unit) = math.nan, sweeps_of_trials(trial, trials, round(MOST_TRIALS * trials))
-            control.on_progress(Progress(trial, of, control.now() - begin, nan, nan, 0, geometry.n_views, unit=unit))
-        return control.stop_of_trials()
+    @property
+    def trial_sweeps(self) -> int:
+        return 0
 
-    def report(iteration: int, residual: float) -> bool:
-        seconds = control.now() - begin
-        history.append(Progress(iteration, planned, seconds, residual, residual, 0, geometry.n_views))
-        if control.on_progress is not None:
-            control.on_progress(history[-1])
-        return control.stop()
+    @abstractmethod
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        """As of `IterativeMethod`."""
 
-    filled, known = masked(problem.projections, problem.use.weights)
-    decide = control.decide or Decisions(problem.seed)
-    projector = Projector(geometry, problem.grid)
-    settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
-    volume = solve(
-        method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        watch=Watch(report, on_trial), decide=decide,
-    )  # fmt: skip
-    chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
-    return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
+    def toy(self) -> Self:
+        return replace(self, iterations=1)
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        """The volume with the history of its iterations.
+
+        Raises:
+            ValueError: as `solve`.
+        """
+        begin, views, trial = control.now(), problem.geometry.n_views, 0
+        history: list[Progress] = []
+
+        def on_trial() -> bool:
+            nonlocal trial
+            trial += 1
+            of, unit = sweeps_of_trials(trial, self.trial_sweeps, round(MOST_TRIALS * self.trial_sweeps))
+            control.tell_part(trial, of, begin, views, unit)
+            return control.stop_of_trials()
+
+        def report(iteration: int, residual: float) -> bool:
+            seconds, planned = control.now() - begin, self.first_sweeps + self.iterations
+            history.append(Progress(iteration, planned, seconds, residual, residual, 0, views))
+            control.tell(history[-1])
+            return control.stop()
+
+        filled, known = masked(problem.projections, problem.use.weights)
+        decide, settings = control.decide or Decisions(problem.seed), asdict(self)
+        volume = solve(
+            self, Projector(problem.geometry, problem.grid), filled, weight=known,
+            nonnegative=not settings["allow_negative"], watch=Watch(report, on_trial), decide=decide,
+        )  # fmt: skip
+        chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
+        return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
 
 
 def prior_decisions(made: Mapping[str, Sequence[Any]]) -> dict[str, Sequence[Any]]:
@@ -228,12 +231,10 @@ def _times_power(array: F32, power: int) -> F32:
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:
     """Data and weights as lines; values that weigh nothing are zero."""
-    expected = projector.projection_shape
-    for name, array in (("projections", projections), ("weight", weight)):
-        if array is not None and array.shape != expected:
-            raise ValueError(f"{name} [view, row, col] have shape {array.shape}, the geometry says {expected}")
+    require_views(projector.geometry, projections)
     finite = np.isfinite(projections)
     if weight is not None:
+        require_views(projector.geometry, weight, "weights")
         if not (np.isfinite(weight).all() and weight.min() >= 0 and weight.max() > 0):
             raise ValueError("weights must be finite, 0 or more, and not all zero")
         finite |= weight == 0

@@ -13,8 +13,7 @@ from scipy.ndimage import gaussian_filter, label, uniform_filter
 from recon.base.arrays import F32, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.slabs import part_of
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid, Volume, part_of
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
 LIMIT = 12.0

@@ -16,16 +16,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
-from recon.base.slabs import bands_of
-from recon.base.volume import Grid, Volume
+from recon.base.declared_types import check_settings
+from recon.base.geometry import Geometry, require_views
+from recon.base.volume import Grid, Volume, bands_of
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
 from recon.kernels.cpu import one_slice as one_slice_cpu
@@ -146,11 +145,11 @@ class Projector:
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
         if self._to_rows():
-            self._mean(volume, result, self._look)
+            self._mean("forward", volume, result)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
-            self._mean(volume, slices, self._look)
-            rows_from_slices(slices, *self._levels(), result)
+            self._mean("forward", volume, slices)
+            rows_from_slices(slices, *levels(self.geometry, self.grid), result)
         return self._spread(result)
 
     def adjoint_lines(self, projections: F32, out: F32 | None = None) -> F32:
@@ -160,52 +159,44 @@ class Projector:
         projections = self._spread(projections)
         if not self._to_rows():
             slices = np.empty((*projections.shape[:2], nz), np.float32)
-            slices_from_rows(projections, *self._levels(), slices)
+            slices_from_rows(projections, *levels(self.geometry, self.grid), slices)
             projections = slices
-        self._mean(projections, result, self._look_back)
+        self._mean("adjoint", projections, result)
         return result
 
-    def _mean(self, source: F32, out: F32, look: Callable[[F32, _Rays, F32], None]) -> None:
-        """The mean over the moments of an exposure of `look`, band by band of slices, from `source` into `out`."""
-        for band, looks in self._bands:
+    def _mean(self, direction: Literal["forward", "adjoint"], source: F32, out: F32) -> None:
+        """The mean over the moments of an exposure, band by band of slices, from `source` into `out`."""
+        for band, moments in self._bands:
             whole = band == slice(0, self.grid.shape[0])
             part = source if whole else np.ascontiguousarray(source[..., band])
             found = out if whole else np.empty((*out.shape[:2], part.shape[2]), np.float32)
-            look(part, looks[0], found)
-            if len(looks) > 1:
+            self._apply(direction, part, moments[0], found)
+            if len(moments) > 1:
                 more = np.empty_like(found)
-                for rays in looks[1:]:
-                    look(part, rays, more)
+                for rays in moments[1:]:
+                    self._apply(direction, part, rays, more)
                     combine(1.0, found, 1.0, more, found)
-                combine(1 / len(looks), found, 0.0, found, found)
+                combine(1 / len(moments), found, 0.0, found, found)
             if not whole:
                 out[..., band] = found
 
-    def _rays(self, views: Geometry) -> _Rays:
+    @property
+    def _kernels(self) -> Any:
+        """The module of the kernels that take these rays."""
         if not self.geometry.is_straight:
-            return _Rays(*posed_cpu.ray_table(views, self.grid))
-        kernels = cone_cpu if self.geometry.is_cone else joseph_cpu
+            return posed_cpu
+        return one_slice_cpu if self._in_one_slice() else cone_cpu if self.geometry.is_cone else joseph_cpu
+
+    def _rays(self, views: Geometry) -> _Rays:
+        kernels = posed_cpu if not self.geometry.is_straight else cone_cpu if self.geometry.is_cone else joseph_cpu
         return _Rays(*kernels.ray_table(views, self.grid))
 
-    def _look(self, volume: F32, rays: _Rays, out: F32) -> None:
-        if not self.geometry.is_straight:
-            posed_cpu.forward(volume, *rays[:2], out)
-        elif self._in_one_slice():
-            one_slice_cpu.forward(volume[:, :, 0], *rays[:2], out[:, :, 0])
-        elif self.geometry.is_cone:
-            cone_cpu.forward(volume, *rays, out)
-        else:
-            joseph_cpu.forward(volume, *rays[:2], out)
-
-    def _look_back(self, projections: F32, rays: _Rays, out: F32) -> None:
-        if not self.geometry.is_straight:
-            posed_cpu.adjoint(projections, *rays[:2], out)
-        elif self._in_one_slice():
-            one_slice_cpu.adjoint(projections[:, :, 0], *rays[:2], out[:, :, 0])
-        elif self.geometry.is_cone:
-            cone_cpu.adjoint(projections, *rays, out)
-        else:
-            joseph_cpu.adjoint(projections, *rays[:2], out)
+    def _apply(self, direction: Literal["forward", "adjoint"], source: F32, rays: _Rays, out: F32) -> None:
+        """One kernel at one moment of the exposures, from `source` into `out`."""
+        kernels = self._kernels
+        if kernels is one_slice_cpu:
+            source, out = source[:, :, 0], out[:, :, 0]
+        getattr(kernels, direction)(source, *(rays if kernels is cone_cpu else rays[:2]), out)
 
     def _spread(self, lines: F32) -> F32:
         """Lines [view, col, row] at the resolution of the views, see `ViewResolution`; its own transpose."""
@@ -213,19 +204,12 @@ class Projector:
             return lines
         return spread(lines, -self._sharpened[:, 0], -self._sharpened[:, 1])
 
-    def _heights(self) -> tuple[NDArray[np.float64], float]:
-        """The row on which z = 0 falls in each view, and the slice at z = 0."""
-        middle = (self.grid.shape[0] - 1) / 2 - self.grid.centre[0] / self.grid.spacing[0]
-        return self.geometry.axis_row + self.geometry.shifts[:, 1], middle
-
-    def _levels(self) -> tuple[NDArray[np.float64], float]:
-        return levels(self.geometry, self.grid)
-
     def _in_one_slice(self) -> bool:
         """All rays of straight views run in the plane of the only slice: a parallel beam, or a fan."""
         if self.grid.shape[0] > 1 or not self.geometry.is_cone:
             return self.grid.shape[0] == 1
-        rows, middle = self._heights()
+        middle = (self.grid.shape[0] - 1) / 2 - self.grid.centre[0] / self.grid.spacing[0]
+        rows = self.geometry.axis_row + self.geometry.shifts[:, 1]
         return self.geometry.detector_shape[0] == 1 and middle == 0 and not rows.any()
 
     def _to_rows(self) -> bool:
@@ -248,17 +232,13 @@ def views_of_exposure(geometry: Geometry) -> list[Geometry]:
 def volume_lines(volume: F32) -> F32:
     """[z, y, x] to a new [y, x, z]."""
     nz, ny, nx = volume.shape
-    out = np.empty((ny, nx, nz), np.float32)
-    swap_last(_plain(volume).reshape(1, nz, ny * nx), out.reshape(1, ny * nx, nz))
-    return out
+    return projection_lines(_plain(volume).reshape(1, nz, ny * nx)).reshape(ny, nx, nz)
 
 
 def volume_slices(lines: F32) -> F32:
     """[y, x, z] to a new [z, y, x]."""
     ny, nx, nz = lines.shape
-    out = np.empty((nz, ny, nx), np.float32)
-    swap_last(lines.reshape(1, ny * nx, nz), out.reshape(1, nz, ny * nx))
-    return out
+    return projection_lines(lines.reshape(1, ny * nx, nz)).reshape(nz, ny, nx)
 
 
 def projection_lines(projections: F32) -> F32:
@@ -269,12 +249,8 @@ def projection_lines(projections: F32) -> F32:
     return out
 
 
-def projection_images(lines: F32) -> F32:
-    """[view, col, row] to a new [view, row, col]."""
-    views, cols, rows = lines.shape
-    out = np.empty((views, rows, cols), np.float32)
-    swap_last(lines, out)
-    return out
+projection_images = projection_lines
+"""[view, col, row] to a new [view, row, col]: the same exchange."""
 
 
 def project(volume: Volume, geometry: Geometry) -> F32:
@@ -282,30 +258,18 @@ def project(volume: Volume, geometry: Geometry) -> F32:
     return Projector(geometry, volume.grid).forward(volume.data)
 
 
-def data_residual(
+def residual_norms(
     volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
-) -> float:
-    """||A x - p|| / ||p||: the share of the measured line integrals [view, row, col] that the volume does not explain.
+) -> tuple[float, float]:
+    """||A x - p|| and ||p||: their ratio is the share of the line integrals [view, row, col] that the volume leaves.
 
     Args:
         weights: of the rays; None: equal weights. Rays of weight 0 do not count.
 
     Raises:
-        ValueError: if `projections` does not fit `geometry`, or is all zero.
+        ValueError: `projections` do not fit the geometry.
     """
-    left, scale = residual_norms(volume, projections, geometry, weights)
-    if scale == 0:
-        raise ValueError("projections are all zero, so there is nothing to explain")
-    return left / scale
-
-
-def residual_norms(
-    volume: Volume, projections: NDArray[np.float32], geometry: Geometry, weights: F32 | None = None
-) -> tuple[float, float]:
-    """||A x - p|| and ||p||; see `data_residual`."""
-    expected = (geometry.n_views, *geometry.detector_shape)
-    if projections.shape != expected:
-        raise ValueError(f"projections have shape {projections.shape}, their geometry says {expected}")
+    require_views(geometry, projections)
     root = np.float32(1) if weights is None else np.sqrt(weights)
     known = projections if weights is None else np.where(weights > 0, projections, np.float32(0))
     left = float(np.linalg.norm(root * (project(volume, geometry) - known)))

@@ -14,12 +14,95 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid
-from recon.kernels.cpu.vectors import extrapolate, replace_by_residual, turn_of_steps
+from recon.kernels.cpu import tv as tv_cpu
+from recon.kernels.cpu.vectors import add_product, extrapolate, replace_by_residual, turn_of_steps
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.resolution import ViewResolution
-from recon.voxels.sweeps import Sweeps
+
+# Rays shorter than this share of the longest ray, and voxels with a column sum below this share of the largest, are
+# left out: their corrections would be divided by almost zero.
+_LEAST_SUM = 1e-3
+
+_LOOKED_AT = 9  # views of a sweep whose residual is kept
+
+
+def interleaved(projector: Projector, subsets: int) -> list[NDArray[np.intp]]:
+    """View indices of each subset: neighbours in angle are in different subsets, so that each covers all directions."""
+    order = np.argsort(np.mod(projector.geometry.angles, projector.geometry.period), kind="stable")
+    count = min(subsets, order.size)
+    return [order[start::count] for start in range(count)]
+
+
+class Sweeps:
+    """Passes over all views, subset by subset. Memory: two volumes, and twice the projections.
+
+    Attributes:
+        pace: a typical step of a sweep along the gradient of ½||A x - p||² (rays weighed).
+        residual: p - A x of some views of the last sweep [view, col, row], times the root of their weight (NaN: 0).
+    """
+
+    def __init__(
+        self, projector: Projector, data: F32, weight: F32 | None, subsets: Sequence[NDArray[np.intp]]
+    ) -> None:
+        """For `data` [view, col, row], each ray weighing `weight` (None: one), in `subsets` of views."""
+        nz, ny, nx = projector.grid.shape
+        self._parts: list[tuple[Projector, F32, F32 | None, F32]] = []
+        self._step = np.zeros((ny, nx, nz), np.float32)  # largest column sums, then their inverse
+        self._gradient = np.empty_like(self._step)
+        for views in subsets:
+            part = projector.subset(views) if len(subsets) > 1 else projector
+            measured = data[views] if len(subsets) > 1 else data
+            rays = None if weight is None else (weight[views] if len(subsets) > 1 else weight)
+            self._gradient[...] = 1
+            plain = part.plain  # sums of absolute values, but for less than 2 in a step
+            scale = _inverse(plain.forward_lines(self._gradient))
+            plain.adjoint_lines(np.ones_like(scale) if rays is None else rays, self._gradient)
+            np.maximum(self._step, self._gradient, out=self._step)
+            if rays is not None:
+                scale *= rays
+            self._parts.append((part, measured, rays, scale))
+        _inverse(self._step)
+        scales = sum(float(part[3].sum(dtype=np.float64)) for part in self._parts)
+        weights = data.size if weight is None else float(weight.sum(dtype=np.float64))
+        self.pace = float(self._step[self._step > 0].mean(dtype=np.float64)) * scales / weights if scales > 0 else 0.0
+
+    def run(self, x: F32, relaxation: float, nonnegative: bool, rng: np.random.Generator | None) -> float:
+        """One sweep over x [y, x, z], in place, the subsets in random order (None: as given).
+
+        Returns:
+            Σ weight (A x - p)², each ray counted before its own correction.
+        """
+        order = np.arange(len(self._parts)) if rng is None else rng.permutation(len(self._parts))
+        total, seen = 0.0, []
+        for index in order:
+            part, data, weight, scale = self._parts[index]
+            residual = part.forward_lines(x)  # the model, until the data are subtracted
+            some = slice(None, None, max(1, len(self._parts) * len(data) // _LOOKED_AT))
+            seen.append(whitened(data[some] - residual[some], None if weight is None else weight[some]))
+            total += replace_by_residual(data, residual, weight, scale)
+            part.adjoint_lines(residual, self._gradient)
+            add_product(x, relaxation, self._step, self._gradient, nonnegative)
+        self.residual = np.concatenate(seen)
+        return total
+
+
+def whitened(residual: F32, weight: F32 | None) -> F32:
+    """The residual times the root of each ray's weight; NaN where that is 0."""
+    if weight is None:
+        return residual
+    return np.where(weight > 0, residual * np.sqrt(weight), np.float32(np.nan)).astype(np.float32, copy=False)
+
+
+def _inverse(sums: F32) -> F32:
+    """1 / sums in place, 0 where they are too small."""
+    least = max(_LEAST_SUM * float(sums.max()), float(np.finfo(np.float32).tiny))
+    seen = sums > least
+    np.divide(1, sums, out=sums, where=seen)
+    sums[~seen] = 0
+    return sums
+
 
 POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
 
@@ -174,3 +257,43 @@ def iterative_memory(
     rays += bool(geometry.width) + bool(ViewResolution.of(geometry, grid).smoothed.any())
     beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
+
+
+def difference_weights(grid: Grid) -> tuple[float, float, float]:
+    """Weights of the differences along (y, x, z), so that TV does not depend on the shape of the voxels."""
+    return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
+
+
+_BACK = (0, 0), (1, 0), (0, 1), (1, 1)  # the four mirror images, but for reflections in a point
+
+
+class TotalVariationProx:
+    """argmin_y ½|y - x|² + threshold TV(y), y >= 0 if wanted; isotropic TV, differences of voxels in 1/voxel.
+
+    A few steps of the dual problem a call (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck &
+    Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
+    iteration x changes little, so later calls continue the steps. Memory: three volumes.
+
+    Differences of a voxel are those to its three next ones; `turn` takes the ones before along y, x or both.
+    """
+
+    def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
+        self._weights, self._dual, self._scratch = weights, tv_cpu.dual_field(shape), tv_cpu.dual_scratch(shape)
+        self._nonnegative, self._steps, self._turn = nonnegative, steps, 0
+
+    def __call__(self, x: F32, threshold: float) -> None:
+        """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
+        if threshold > 0:
+            given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
+            for _ in range(self._steps):
+                tv_cpu.dual_step(x, self._dual, *given, back)
+            tv_cpu.primal(x, self._dual, *given, x)
+        elif self._nonnegative:
+            np.maximum(x, 0, out=x)
+
+    def turn(self) -> None:
+        """Take the differences of the next of four mirror images from here on, so that no side is preferred.
+
+        The differences, which the dual field holds, stay: only which three of them belong to a voxel changes.
+        """
+        self._turn = (self._turn + 1) % len(_BACK)

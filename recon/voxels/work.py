@@ -19,8 +19,7 @@ from recon.voxels.held_out import (
     TRIALS,
     TV_STEPS,
 )
-from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.pnp_dct import STEPS, TRIAL_STEPS
+from recon.voxels.priors import STEPS, TRIAL_STEPS, subsets_of
 from recon.voxels.projector import Projector, views_of_exposure
 from recon.voxels.voxel_problem import POWER_ROUNDS, POWER_ROWS
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,9 +19,8 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.devices.camera_view import CameraView, Exposed
-from simulators.devices.shutter import BeamGate, SampleGate
 from simulators.devices.trigger_line import TriggerLine
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION, OFFSET
 from simulators.frame.shot import CannotExposeError
@@ -68,7 +67,7 @@ class SimulatedOrcaQuest:
     Args:
         scene: what stands in the beam.
         seed: of all random numbers, with the effect's name and the frame's number over the camera's life.
-        shutter, sample: looked at when a frame is exposed: dark, flat or projection.
+        beam_is_on, sample_is_in: asked when a frame is exposed: dark, flat or projection.
     """
 
     def __init__(
@@ -77,13 +76,13 @@ class SimulatedOrcaQuest:
         line: TriggerLine,
         clock: Clock,
         seed: int,
-        shutter: BeamGate,
-        sample: SampleGate,
+        beam_is_on: Callable[[], bool],
+        sample_is_in: Callable[[], bool],
         build: OrcaQuestBuild = _USUAL,
     ) -> None:
         self.name, self._model = build.name, build.model
         self._scene, self._line, self._clock, self._seed = scene, line, clock, seed
-        self._shutter, self._sample, self._build = shutter, sample, build
+        self._beam_is_on, self._sample_is_in, self._build = beam_is_on, sample_is_in, build
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
         self._timing = orca_quest.timing(self._settings, model=self._model)
         self._connected = clock.now()
@@ -278,7 +277,7 @@ class SimulatedOrcaQuest:
             self._gone = f"does not answer any more: it was unplugged at frame {self._frames}"
             return
         ready = time + self._settings.exposure + self._timing.readout
-        beam, sample = self._shutter.is_open(), self._sample.is_in()
+        beam, sample = self._beam_is_on(), self._sample_is_in()
         if self._frames not in self._build.lost:
             self._ring.append(Exposed(self._framestamp, self._frames, time, angle, ready, beam, sample, self._views))
         self._framestamp += 1

@@ -7,8 +7,11 @@ With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+MOVES_REMEMBERED = 4096  # A camera on a virtual clock may ask for past angles. They are known for this many moves.
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,47 @@ class TrapezoidMove:
             for phase in self.phases
             if phase.begin < seconds
         )
+
+
+class MovedAxis:
+    """An axis that turns the sample by moves in closed form, and remembers the last ones.
+
+    Args:
+        begin: s, on any clock; from then on it stands at `counts`.
+        counts_per_turn: for 2π of true angle.
+    """
+
+    def __init__(self, begin: float, counts: float, counts_per_turn: int) -> None:
+        self.zero = 0
+        """Count at the true angle 0; a preset of the counter changes it."""
+        self._angle_of_count = 2 * math.pi / counts_per_turn
+        self._moves = deque([(TrapezoidMove(begin, counts, counts, ()), self.zero)], maxlen=MOVES_REMEMBERED)
+
+    @property
+    def move(self) -> TrapezoidMove:
+        """The move under way, or the last one."""
+        return self._moves[-1][0]
+
+    def angle_at(self, time: float) -> float:
+        """True angle in radians at any time since the oldest move remembered."""
+        move, zero = self._at(time)
+        return (move.position(time) - zero) * self._angle_of_count
+
+    def disturb(self, beyond: Callable[[float], float]) -> None:
+        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
+        self._replace(replace(self.move, beyond=beyond))
+
+    def _at(self, time: float) -> tuple[TrapezoidMove, int]:
+        """The move at a time, and the count at the true angle 0 then."""
+        return next((past for past in reversed(self._moves) if past[0].begin <= time), self._moves[0])
+
+    def _remember(self, move: TrapezoidMove) -> None:
+        """A new move begins."""
+        self._moves.append((move, self.zero))
+
+    def _replace(self, move: TrapezoidMove) -> None:
+        """The move under way gets another end."""
+        self._moves[-1] = (move, self.zero)
 
 
 def _seconds_for(distance: float, phase: MotionPhase, sign: int) -> float:

@@ -7,16 +7,13 @@ exact times, the moment it starts. A stop removes the pulses that are still to c
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntFlag
 
 from drivers.base.clock import Clock
-from simulators.devices.motion import TrapezoidMove
+from simulators.devices.motion import MovedAxis, TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
-
-MOVES_REMEMBERED = 4096  # A camera on a virtual clock may ask for past angles. They are known for this many moves.
 
 
 class Ended(IntFlag):
@@ -117,7 +114,7 @@ def _arrival(move: TrapezoidMove, position: int) -> float | None:
     return move.time_at(position) if low <= position <= high and position != move.start else None
 
 
-class PulseMotor:
+class PulseMotor(MovedAxis):
     """One axis. `line()` is the cable in its trigger output, or None without a cable.
 
     Args:
@@ -141,20 +138,12 @@ class PulseMotor:
         switch_at: int | None = None,
         fires_at_start: bool = True,
     ) -> None:
+        super().__init__(clock.now(), 0.0, counts_per_turn)
         self.stall_at, self.switch_at = stall_at, switch_at
         self.trigger = MotorOutput(lost, fires_at_start)
         self.limits: tuple[int, int] | None = None
         self.ended = Ended(0)
         self._clock, self._line = clock, line
-        self._angle_of_count = 2 * math.pi / counts_per_turn
-        self.zero = 0
-        """Count of the place where it stood at power-on."""
-        self._moves = deque([(TrapezoidMove(clock.now(), 0.0, 0.0, ()), self.zero)], maxlen=MOVES_REMEMBERED)
-
-    @property
-    def move(self) -> TrapezoidMove:
-        """The move under way, or the last one."""
-        return self._moves[-1][0]
 
     def moving(self) -> bool:
         return self._clock.now() < self.move.end
@@ -163,20 +152,11 @@ class PulseMotor:
         """Pulses put out so far, signed."""
         return self.move.counts(self._clock.now())
 
-    def angle_at(self, time: float) -> float:
-        """True angle in radians at any time since the oldest move remembered."""
-        move, zero = next((past for past in reversed(self._moves) if past[0].begin <= time), self._moves[0])
-        return (move.position(time) - zero) * self._angle_of_count
-
     def preset(self, count: int) -> None:
         """Set the count of the present place to `count`; nothing turns."""
         now, here = self._clock.now(), self.position()
         self.zero += count - here
-        self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
-
-    def disturb(self, beyond: Callable[[float], float]) -> None:
-        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
-        self._replace(replace(self.move, beyond=beyond))
+        self._remember(TrapezoidMove(now, count, count, ()))
 
     def start(self, target: int, speed: float, acceleration: float) -> None:
         """Move from standing to `target` (counts; counts/s, counts/s²), or to the limit or stall on the way."""
@@ -190,7 +170,7 @@ class PulseMotor:
                 move, self.ended = move.halted(stop), why
         if (here >= high and move.direction > 0) or (here <= low and move.direction < 0):
             move, self.ended = TrapezoidMove(now, here, here, ()), Ended.LIMIT
-        self._moves.append((move, self.zero))
+        self._remember(move)
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
@@ -209,10 +189,6 @@ class PulseMotor:
             self._replace(self.move.halted(self.position()))
             self._put_on_line(now)
         self.ended = Ended.EMERGENCY
-
-    def _replace(self, move: TrapezoidMove) -> None:
-        """Replace the end of the move under way."""
-        self._moves[-1] = (move, self.zero)
 
     def _put_on_line(self, now: float) -> None:
         edges = self.trigger.follow(self.move, now)

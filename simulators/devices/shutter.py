@@ -1,37 +1,55 @@
-"""Simulated shutter and sample mover: one state each, no travel time, or on a cable; the simulated camera asks both."""
+"""Simulated devices in the beam, which the simulated camera shows: shutter, sample mover and monochromator."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from typing import Protocol
 
-from simulators.devices.trigger_line import TriggerLine
+from drivers.base.clock import Clock
+from simulators.scenes.scene import Scene
 
-
-class BeamGate(Protocol):
-    """The part of a shutter that a simulated camera asks."""
-
-    def is_open(self) -> bool: ...
+POLL = 0.05  # s between looks at who may end the wait
 
 
-class SampleGate(Protocol):
-    """The part of a sample mover that a simulated camera asks."""
+class SimulatedMonochromator:
+    """Implements `drivers.base.protocols.Monochromator` and `Watchable`.
 
-    def is_in(self) -> bool: ...
+    Args:
+        energy: keV of the scene as it is; None: it states none.
+        scene_at: the scene at an energy in keV; an error of it leaves the monochromator where it stands.
+        show: takes the sample and the beam of all later frames.
+        settle: s that each move takes.
+    """
 
+    def __init__(
+        self,
+        energy: float | None,
+        scene_at: Callable[[float], Scene],
+        show: Callable[[Scene], None],
+        clock: Clock,
+        settle: float = 0.0,
+        name: str = "monochromator",
+    ) -> None:
+        self.name = name
+        self._energy, self._scene_at, self._show = energy, scene_at, show
+        self._clock, self._settle = clock, settle
+        self._check: Callable[[], None] = lambda: None
 
-IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
+    def watch(self, check: Callable[[], None]) -> None:
+        self._check = check
 
+    def move_to(self, energy: float) -> None:
+        if energy == self._energy:
+            return
+        scene = self._scene_at(energy)
+        deadline = self._clock.now() + self._settle
+        while (left := deadline - self._clock.now()) > 0:
+            self._check()
+            self._clock.sleep(min(POLL, left))
+        self._show(scene)
+        self._energy = energy
 
-class MovedSample:
-    """A sample that a motor moves: it is in the beam while the motor stands at `inside` (rad)."""
-
-    def __init__(self, axis: TriggerLine, inside: float) -> None:
-        self._axis, self._inside = axis, inside
-
-    def is_in(self) -> bool:
-        return abs(self._axis.angle_at(self._axis.clock.now()) - self._inside) < IN_PLACE
+    def energy(self) -> float | None:
+        return self._energy
 
 
 class SimulatedShutter:
@@ -51,16 +69,6 @@ class SimulatedShutter:
 
     def is_open(self) -> bool:
         return self._open
-
-
-class WiredShutter:
-    """A shutter that follows the level of a cable; the camera asks it, the driver sets the cable's other end."""
-
-    def __init__(self, high: Callable[[], bool], open_high: bool = True) -> None:
-        self._high, self._open_high = high, open_high
-
-    def is_open(self) -> bool:
-        return self._high() is self._open_high
 
 
 class SimulatedSampleMover:

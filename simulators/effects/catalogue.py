@@ -1,12 +1,13 @@
 """Catalogue: every effect by name, with its domain and its place in it; no effect's module is imported here.
 
-The module of effect `photon_noise` is simulators.effects.photon_noise, and its class PhotonNoise. It is imported when a
+The module of effect `photon_noise` is simulators.effects.sensor, and its class PhotonNoise. It is imported when a
 scene names the effect. EFFECTS of a folder has those in it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
@@ -19,25 +20,26 @@ __all__ = ["CATALOGUE", "FINAL", "Domain", "EffectRow", "load_effect", "order_er
 FINAL = frozenset({"photon_noise", "read_noise", "adc"})
 """Effects that end their domain: nothing of that domain may follow."""
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
+_exposure, _sensor = (partial(EffectRow, module=f"simulators.effects.{name}") for name in ("exposure", "sensor"))
 _OURS: Mapping[str, EffectRow] = MappingProxyType(
     {
-        "motion_blur": EffectRow(Domain.MOTION, "the sample turns during the exposure"),
-        "pixel_area": EffectRow(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
-        "beam_profile": EffectRow(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
-        "quantum_efficiency": EffectRow(
+        "motion_blur": _exposure(Domain.MOTION, "the sample turns during the exposure"),
+        "pixel_area": _exposure(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
+        "beam_profile": _exposure(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
+        "quantum_efficiency": _sensor(
             Domain.PHOTONS,
             "the sensor detects a share of the photons",
             frozenset({"scatter"}),
             "stray light is detected like any other",
         ),
-        "photon_noise": EffectRow(Domain.PHOTONS, "photons arrive at random"),
-        "dark_current": EffectRow(Domain.ELECTRONS, "electrons that arise without light"),
-        "saturation": EffectRow(
+        "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),
+        "dark_current": _sensor(Domain.ELECTRONS, "electrons that arise without light"),
+        "saturation": _sensor(
             Domain.ELECTRONS, "a pixel holds no more than its full well", _CHARGE, "charge of any origin fills a pixel"
         ),
-        "read_noise": EffectRow(Domain.ELECTRONS, "noise of the readout"),
-        "offset": EffectRow(Domain.COUNTS, "the digital bias"),
-        "adc": EffectRow(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
+        "read_noise": _sensor(Domain.ELECTRONS, "noise of the readout"),
+        "offset": _sensor(Domain.COUNTS, "the digital bias"),
+        "adc": _sensor(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
         **in_folders("simulators.effects", "EFFECTS"),
     }
 )
@@ -84,5 +86,9 @@ def load_effect(name: str) -> type[Any]:
     """The class (see chain.AnyEffect) of an effect; this imports its module."""
     if name in _PLUGGED:
         return _PLUGGED[name]
-    module = import_module(f"{CATALOGUE[name].package}.{name}")
-    return getattr(module, name.title().replace("_", ""))
+    return getattr(import_module(CATALOGUE[name].module), class_of(name))
+
+
+def class_of(name: str) -> str:
+    """PhotonNoise for photon_noise."""
+    return name.title().replace("_", "")

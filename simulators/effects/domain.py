@@ -29,11 +29,11 @@ class EffectRow:
         summary: what happens, in half a sentence.
         follows: effects of the same domain that must come before it, because another order changes the frame.
         reason: why they come before it.
-        package: of its module, whose name is the effect's.
+        module: with its class, which has its name in capitals: PhotonNoise for photon_noise.
     """
 
     domain: Domain
     summary: str
     follows: frozenset[str] = frozenset()
     reason: str = ""
-    package: str = "simulators.effects"
+    module: str = ""

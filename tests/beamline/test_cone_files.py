@@ -26,7 +26,7 @@ from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
-from recon.voxels.fdk import fdk
+from recon.voxels.direct import fdk
 from tests.beamline.cli.small_scan import beamline
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5

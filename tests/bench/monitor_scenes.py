@@ -18,14 +18,12 @@ from scipy.ndimage import gaussian_filter
 
 from beamline.monitor.digest import FrameDigest, digest
 from drivers.base.frame import Frame, FrameKind
-from simulators.effects.anomaly import Label
-from simulators.effects.beam.ghost import Ghost
-from simulators.effects.beam.lost_beam import LostBeam
+from simulators.effects.beam.open_beam import Ghost, LostBeam
 from simulators.effects.catalogue import Domain
-from simulators.effects.chain import AnyEffect, Chain
-from simulators.effects.detector.zingers import Zingers
-from simulators.effects.scattering.floaters import Floaters
-from simulators.effects.stage.jump import Jump
+from simulators.effects.chain import AnyEffect, Chain, Label
+from simulators.effects.detector.pixels import Zingers
+from simulators.effects.scattering.deflected import Floaters
+from simulators.effects.stage.errors import Jump
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Shot, fixed_rng

@@ -19,7 +19,7 @@ import recon
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.calibration.freedom import knowable
+from recon.features.calibration.joint import knowable
 from recon.features.calibration.learn import learn_geometry
 from tests.recon.features.calibration.bodies import Bodies, balls, sponge
 

@@ -15,8 +15,8 @@ from recon import AsdPocs, Cgls, FistaTv, OsSirtTv, Sart, Sirt
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk
 from recon.voxels.iterative import Watch, solve
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for

@@ -17,7 +17,7 @@ import recon
 from recon.assess.metrics import psnr
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid
-from recon.splatting.last_round import LastRound
+from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
 from recon.warm_up import warm_up
 from tests.bench.test_anytime_curve import ORDERS, VIEWS, Scan, particles, two_cores

@@ -17,7 +17,7 @@ import pytest
 from beamline.monitor import watch
 from beamline.monitor.check import Flag, Level, ScanContext
 from drivers.base.frame import FrameKind
-from simulators.effects.stage.jump import Jump
+from simulators.effects.stage.errors import Jump
 from simulators.scenes.expose import Scan
 from simulators.scenes.scene import Scene
 from tests.bench.monitor_scenes import (

@@ -19,8 +19,7 @@ from recon.assess.metrics import psnr, ssim3d
 from recon.base.kernel import Kernel
 from recon.base.method import RunControl
 from recon.features.published.r2_published import R2Published, published_fit
-from recon.splatting.density_control import DensityPolicy
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.warm_up import warm_up
 from tests.bench.quality_cases import Case, cone, seen_by_simulator
 

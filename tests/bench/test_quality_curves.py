@@ -1,4 +1,4 @@
-"""Measures the table in recon/assess/plans.py: dB above FBP against steps, by method, binning and Gaussians.
+"""Measures the table in recon/assess/time_model.py: dB above FBP against steps, by method, binning and Gaussians.
 
 Run with  pytest -m bench -s tests/bench/test_quality_curves.py ; it prints the table as it stands in that module. It
 takes 10 to 15 minutes of CPU time, and only its ratios of times mean something on another machine.
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 import recon
 from recon.assess.metrics import psnr
-from recon.assess.plans import CURVES, QualityCurve
-from recon.base.binning import bin_views
+from recon.assess.time_model import CURVES, QualityCurve
+from recon.base.arrays import bin_views
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
@@ -28,12 +28,12 @@ from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp
 from recon.voxels.held_out import choice_sweeps
-from recon.voxels.projector import data_residual
 from recon.warm_up import warm_up
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from tests.bench.spheres import spheres
+from tests.recon.helpers import data_residual
 
 F32 = NDArray[np.float32]
 Kind = tuple[str, str, int, float, tuple[int, ...]]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import place

@@ -32,9 +32,8 @@ from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
 from recon.kernels.cpu.losses import CpuProjectionLoss, total_variation
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.splatting import optimise as fit
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import NAMES, FitSettings
+from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
 from recon.splatting.splat import project
 from recon.warm_up import warm_up
 from tests.recon.helpers import run_steps

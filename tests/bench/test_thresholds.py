@@ -28,8 +28,7 @@ from recon.assess.metrics import psnr
 from recon.base import empirical
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.splatting.density_control import DensityPolicy
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 from tests.bench import quality_cases
 from tests.bench.quality_cases import SLABS, Case
 from tests.bench.test_patch_prior import PHOTONS, TEXTURED, TUNED, VIEWS

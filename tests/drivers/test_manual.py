@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from drivers.base.protocols import SampleMover, Shutter
-from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
+from drivers.in_beam import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
 
 
 def test_the_shutter_asks_for_each_change_and_not_again() -> None:

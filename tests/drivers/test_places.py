@@ -9,9 +9,8 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import SampleMover
-from drivers.places import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.in_beam import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
 from simulators.wires.serial_url import register

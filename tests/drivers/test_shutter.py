@@ -6,7 +6,7 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import Shutter
-from drivers.shutter import OutputShutter
+from drivers.in_beam import OutputShutter
 from simulators.devices.clock import VirtualClock
 
 

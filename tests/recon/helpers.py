@@ -6,10 +6,14 @@ from collections.abc import Callable
 
 import torch
 
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.volume import Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.optimise import FitState, step
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import FitSettings
+from recon.voxels.projector import residual_norms
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
@@ -54,3 +58,9 @@ def run_steps(
         if on_step is not None and on_step(state):
             break
     return state
+
+
+def data_residual(volume: Volume, projections: F32, geometry: Geometry, weights: F32 | None = None) -> float:
+    """||A x - p|| / ||p||: the share of the line integrals [view, row, col] that the volume does not explain."""
+    left, scale = residual_norms(volume, projections, geometry, weights)
+    return left / scale

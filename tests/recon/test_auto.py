@@ -18,7 +18,7 @@ from recon.base.volume import Volume
 from recon.voxels import held_out
 from recon.voxels.direct import Fbp
 from recon.voxels.iterative import prior_decisions
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]

@@ -9,12 +9,12 @@ import pytest
 
 import recon
 from recon import methods
-from recon.auto import Auto
+from recon.auto import Auto, part_of
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
-from recon.trials import part_of
 from recon.voxels.odd_views import odd_views
-from recon.voxels.projector import Projector, data_residual, seen_rays
+from recon.voxels.projector import Projector, seen_rays
+from tests.recon.helpers import data_residual
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])

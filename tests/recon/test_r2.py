@@ -11,8 +11,7 @@ import recon
 import recon.splatting.initialise
 from recon import R2, DataUse, RunControl
 from recon.assess.metrics import psnr
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import recon
+from recon.auto import part_of
 from recon.base.method import DataUse, ReconProblem
-from recon.trials import part_of
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]

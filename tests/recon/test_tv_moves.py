@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import Truncation
+from recon.base.kernel import Truncation
 from recon.base.volume import Grid
 from recon.kernels.reference import total_variation
 from recon.splatting import optimise as fit

@@ -24,7 +24,7 @@ import gc
 import numpy as np
 import recon
 from recon.splatting.settings import FitSettings
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.warm_up import warm_up
 
 def compiled():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose
 from tests.simulators import shots

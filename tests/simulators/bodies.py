@@ -14,8 +14,17 @@ from scipy.spatial.transform import Rotation
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.packing import rotation
-from simulators.samples.bodies.polyhedra import octahedron, plate, truncated_octahedron
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid, Vector
+from simulators.samples.bodies.solids import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Polyhedron,
+    Solid,
+    Vector,
+    octahedron,
+    plate,
+    truncated_octahedron,
+)
 
 Reals = NDArray[np.float64]
 

@@ -19,9 +19,8 @@ from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
-from beamline.core.narration import sentence
 from beamline.core.process import ChildProcess
-from beamline.core.sinks import fan_out
+from beamline.core.sinks import fan_out, sentence
 from beamline.core.stop import StopRequest, stop_signals
 from drivers.base.clock import Clock, SystemClock
 

@@ -22,7 +22,7 @@ from beamline.config.devices import DcamOrca
 from beamline.features.doctor.check import Diagnosis, Grade, of_error
 from drivers.base.errors import DeviceError
 from drivers.dcam import session as usb
-from drivers.serial.ports import SerialPort
+from drivers.serial.line import SerialPort
 
 if TYPE_CHECKING:
     from drivers.dcam.abi import Dcam

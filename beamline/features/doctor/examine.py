@@ -16,11 +16,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from beamline.config.beam import BeamMonitorSection, FoundMonochromator
+from beamline.config.beam import BeamMonitorSection, FoundFilter, FoundMonochromator, MotorFilter
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, FilterConfig, MonochromatorConfig
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
-from beamline.config.places import FoundFilter, MotorFilter
 from beamline.core.machine import free_memory
 from beamline.core.own_packages import OWN_PACKAGES, clashing_distributions
 from beamline.core.text import size
@@ -35,7 +34,7 @@ from beamline.storage.writer_lock import no_locks
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
-from drivers.serial.ports import SerialPort, serial_ports
+from drivers.serial.line import SerialPort, serial_ports
 
 SECONDS, MOST = 3.0, 4 << 30  # Longest time (s on the clock) and most bytes of a measurement
 PIECE = 16 << 20  # Bytes that are written and synchronised together

@@ -13,7 +13,7 @@ from beamline.projections.selection import Selection, choose_views, geometry_of,
 from beamline.projections.step import StepDone, options_of
 from beamline.storage.readers.base import EmissionOf, ScanSource
 from recon.prep.correct import Projections
-from recon.prep.emission import Emission, weighted_lines
+from recon.prep.counts import Emission, weighted_lines
 
 
 def prepare_emission(

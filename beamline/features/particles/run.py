@@ -35,8 +35,16 @@ from recon.features.particles.particles import (
     parted,
     volume_deviation,
 )
-from recon.post.clusters import Clusters, clusters
-from recon.post.enhance import Box, enhanced, enhanced_deviation, grey_at, inscribed_box, sample_circle
+from recon.post.enhance import (
+    Box,
+    Clusters,
+    clusters,
+    enhanced,
+    enhanced_deviation,
+    grey_at,
+    inscribed_box,
+    sample_circle,
+)
 
 _SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
 

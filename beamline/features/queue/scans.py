@@ -23,7 +23,7 @@ from beamline.core.events import Done, Event, RunStarted, Sink, StateEntered
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.stop import StopRequest
 from beamline.core.text import count, size
-from beamline.instrument.operator import ask_operator
+from beamline.instrument.connect import ask_operator
 from beamline.plan.limits import ROOM
 from beamline.plan.timeline import duration_text
 from beamline.scan.preflight import DryRun, dry_run

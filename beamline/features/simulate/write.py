@@ -24,7 +24,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.cost.explain import FrameCost, explain
 from simulators.scenes.expose import PlannedFrame, Scan, expose

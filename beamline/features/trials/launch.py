@@ -26,7 +26,7 @@ from recon.base.arrays import F32, F64, I64
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 from recon.base.method import Energies
 from recon.prep.correct import Projections
-from recon.prep.emission import Emission, weighted_lines
+from recon.prep.counts import Emission, weighted_lines
 
 VolumeAt = Callable[[float], F32]
 """The volume [z, y, x] that a view of this time, or of the energy of this number, shows."""

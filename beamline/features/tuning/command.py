@@ -60,8 +60,7 @@ def evaluated(
 ) -> Found:  # fmt: skip
     """What `evaluate` finds in views from `angle`, degrees, printed as lines or JSON."""
     from beamline.config.load import load
-    from beamline.instrument.connect import connect
-    from beamline.instrument.operator import ask_operator
+    from beamline.instrument.connect import ask_operator, connect
 
     with json_events(as_json) as json_sink:
         config = load(file, overrides)

@@ -12,7 +12,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.projections.step import StepDone, StepMemory, option
-from recon.base.binning import bin_views, factor_within
+from recon.base.arrays import bin_views, factor_within
 from recon.base.views import spread
 from recon.base.volume import Grid
 

@@ -90,8 +90,8 @@ def with_dynamic_flats(
         ConfigError: there are too few flats.
     """
     from beamline.projections.read import read_binned, spoilt_frames
-    from recon.prep.defects import dead_pixels
     from recon.prep.dynamic_flats import find_dynamic_flats
+    from recon.prep.references import dead_pixels
 
     asked = selection.step(Preparation)
     frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))

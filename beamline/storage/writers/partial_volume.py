@@ -26,7 +26,7 @@ from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.scratch import reserve
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
 from beamline.storage.writers.recon_file import SUFFIXES, rewrite_facts, value_of, write_record
-from recon.base.slabs import Slab
+from recon.base.volume import Slab
 
 _SLABS = "entry/reconstruction/slabs"
 _PLACES = {

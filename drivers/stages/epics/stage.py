@@ -11,16 +11,62 @@ import contextlib
 import math
 from contextlib import closing
 from dataclasses import dataclass
-from typing import NoReturn
+from enum import StrEnum
+from typing import ClassVar, NoReturn
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import DigitalOutput, TriggerTrain
+from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
-from drivers.stages.epics.settings import EpicsSettings, Search
-from drivers.stages.kept import FoundSettings, SettingsStore
-from drivers.stages.shared import LineStage, Stops, found_at_opening, until_standing, while_it_moves
-from drivers.stages.travel import Travel
+from drivers.flat import Declared
+from drivers.stages.settings import StageFigures, Wiring, key
+from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
+
+
+class Search(StrEnum):
+    """The direction in which the record searches its reference."""
+
+    NONE = "none"
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+    @property
+    def field(self) -> str:
+        """Field of the record that begins the search."""
+        return {"none": "", "forward": ".HOMF", "reverse": ".HOMR"}[self]
+
+
+@dataclass(frozen=True)
+class EpicsSettings(Declared):
+    """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
+
+    `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key
+    says deg.
+    """
+
+    pulse_output: ClassVar[None] = None
+    """A motor record sets no output."""
+    wiring: ClassVar[Wiring] = Wiring()
+    """No cable: only checks of trigger pulses ask for it."""
+    figures: StageFigures
+    unit: str = key("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
+    search: Search = key(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
+    tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0)
+
+    def limits(self) -> StageLimits:
+        """See `StageSettings`."""
+        figures = self.figures
+        return StageLimits(
+            figures.counts_per_turn,
+            figures.max_speed,
+            figures.acceleration,
+            figures.low,
+            figures.high,
+            False,
+            tolerance=self.tolerance,
+        )
+
 
 HOMED = 0x4000 | 0x0080
 """MSTA: the reference was found, or it stands there."""
@@ -63,22 +109,14 @@ class EpicsStage(LineStage):
     Settings = EpicsSettings
 
     def __init__(self, url: str, settings: EpicsSettings, clock: Clock, name: str = "stage") -> None:
-        self.name = name
-        self._clock, self._url, self._settings = clock, url, settings
-        self._travel = Travel(name, settings.limits())
-        self._stops = Stops(name, self._send_stop)
-        self._target: int | None = None
-        self._searching, self._stops_before = False, 0
-        self._last = ""
+        super().__init__(url, settings, clock, name)
+        self._settings, self._last = settings, ""
         self._channel = open_channel(url, name, settings.timeout)
         self._begun = self._looked = self._same_since = -math.inf  # s: the last move, the last look, the same place
         self._place = math.nan
         self._found = FoundSettings()
-        try:
+        with self._closed_on_failure():
             self._model = self._checked()
-        except BaseException:
-            self._channel.close()
-            raise
 
     @staticmethod
     def halt(url: str, settings: EpicsSettings, clock: Clock) -> None:
@@ -89,7 +127,6 @@ class EpicsStage(LineStage):
         target = self._travel.target(angle)
         if not 0 < speed <= self.limits.max_speed * (1 + 1e-12) or math.degrees(speed) < self._slowest:
             raise self._travel.no_such_speed(speed, f"{self._slowest:g} deg/s or more")
-        self._stops_before = self._stops.count
         with self._stops.none_while("the move"):
             self._standing("a move")
             self._refuse_unless_it_would_go()
@@ -119,7 +156,6 @@ class EpicsStage(LineStage):
                 advice="Set devices.stage.search to forward or reverse, or home it in the record's own screen",
                 state="Nothing has moved",
             )
-        self._stops_before = self._stops.count
         with self._stops.none_while("the search for the reference"):
             self._standing("a search for the reference")
             self._refuse_unless_it_would_go()
@@ -135,7 +171,7 @@ class EpicsStage(LineStage):
         self._looked, self._place = now, status.place
         if not status.done:
             return True
-        if self._target is None or self._is_at_target(status) or self._was_stopped:
+        if self._target is None or self._is_at_target(status) or self._stops.came_since:
             return False
         return now - self._begun < STILL or (recent and not same)
 
@@ -143,17 +179,17 @@ class EpicsStage(LineStage):
         until_standing(self._clock, self.moving, bool, timeout)
         status, target = self._status(), self._target  # read anew: RBV may have been read before DMOV became 1
         arrived = target is None or self._is_at_target(status)
-        if status.done and not (arrived or self._was_stopped):  # it says so, and is not there: look whether it stands
+        if status.done and not (arrived or self._stops.came_since):
+            # It says that it is done, and is not there: look whether it stands.
             longest = max(timeout, CREEP)
             until_standing(self._clock, lambda: self.moving() or not self._seen_to_stand, bool, longest)
             status = self._status()
             arrived = self._is_at_target(status)
-        counts = self._counts_of(status)
-        aim = "its reference" if self._searching else "" if target is None else self._travel.degrees(target)
-        if not status.done or not (arrived or self._was_stopped or self._seen_to_stand):
+        counts, aim = self._counts_of(status), self._aim
+        if not status.done or not (arrived or self._stops.came_since or self._seen_to_stand):
             raise self._travel.still_moving(timeout, counts, aim, self._last, self._hindrance())
         if self._searching:
-            arrived = not self._was_stopped and bool(status.bits & HOMED)
+            arrived = not self._stops.came_since and bool(status.bits & HOMED)
         fault, advice = status.fault
         if not arrived and not fault:
             fault = self._hindrance()
@@ -191,17 +227,9 @@ class EpicsStage(LineStage):
             **self._travel.described(),
         }
 
-    def close(self) -> None:
-        with contextlib.suppress(DeviceError):  # a record that is gone, or closed already
+    def _release(self) -> None:
+        with closing(self._channel):
             self._found.restore(lambda suffix, value: self._channel.write(suffix, float(value)))
-        self._channel.close()
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        self._found.keep_in(store)
-
-    @property
-    def _was_stopped(self) -> bool:
-        return self._stops.count != self._stops_before
 
     @property
     def _seen_to_stand(self) -> bool:

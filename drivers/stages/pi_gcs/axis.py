@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from drivers.base.errors import DeviceRefused
-from drivers.stages.kept import FoundSettings
 from drivers.stages.pi_gcs.line import (
     ANY_NUMBER,
     NOT_ALLOWED_TO_MOVE,
@@ -24,7 +23,7 @@ from drivers.stages.pi_gcs.line import (
     plain,
 )
 from drivers.stages.pi_gcs.settings import PiGcsSettings, TriggerWindow
-from drivers.stages.shared import while_it_moves
+from drivers.stages.shared import FoundSettings, while_it_moves
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
 ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"

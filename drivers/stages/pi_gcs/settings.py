@@ -9,12 +9,12 @@ the start threshold, from memory, see `PiFirstPulse`.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 from fractions import Fraction
 
 from drivers.base.protocols import StageLimits, TriggerTrain
+from drivers.flat import Declared
 from drivers.stages.settings import StageFigures, Wiring, key
 
 PULLED_APART = Fraction(1, 10)
@@ -96,7 +96,7 @@ class Reference(StrEnum):
 
 
 @dataclass(frozen=True)
-class PiGcsSettings:
+class PiGcsSettings(Declared):
     """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
 
     The axis is named as SAI? lists it. `firmware_pulse` is from memory; trains need equal pauses between pulses. A
@@ -123,10 +123,9 @@ class PiGcsSettings:
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.wiring.pulse_width is not None:
             raise ValueError("pulse_width_s cannot be set: the firmware of a pi_gcs controller fixes it; set null")
-        if not re.fullmatch(AXIS_NAME, self.axis):
-            raise ValueError(f"axis {self.axis!r} is not a legal name; expected 1 to 16 letters, digits and _")
         self.limits()
 
     @property

@@ -7,19 +7,16 @@ come from a digital output in trigger mode 0; the controller does not count them
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.kept import SettingsStore
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.line import EVENTS, MOTION, STOPPED, GcsLine, GcsOutput, advice, meaning
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings, is_spent_by, window_of
-from drivers.stages.shared import POLL, LineStage, Stops, found_at_opening, refuse_another, until_standing
-from drivers.stages.travel import Travel
+from drivers.stages.shared import POLL, LineStage, found_at_opening, refuse_another, until_standing
 
 
 class PiGcsStage(LineStage):
@@ -36,27 +33,19 @@ class PiGcsStage(LineStage):
     Settings = PiGcsSettings
 
     def __init__(self, url: str, settings: PiGcsSettings, clock: Clock, name: str = "stage") -> None:
-        self.name = name
-        self._clock, self._url, self._settings = clock, url, settings
-        self._travel = Travel(name, settings.limits())
+        super().__init__(url, settings, clock, name)
+        self._settings = settings
         self._per_radian = Fraction(settings.figures.counts_per_turn) / Fraction(2 * math.pi)
-        self._target: int | None = None
-        self._homing = False
-        self._stops = Stops(name, self._send_stop)
-        self._stops_before = 0
         self._train: TriggerTrain | None = None
         self._told = 0  # the code of the error register that an error has told
-        self._closed = False
         self._line = GcsLine(url, settings.axis, settings.wiring, clock, name)
         self._axis = PiGcsAxis(self._line, settings, name)
-        try:
+        self._found = self._axis.found
+        with self._closed_on_failure():
             self._identity = self._axis.open(Fraction(settings.figures.acceleration) * self._per_radian)
             self._serial = self._identity.split(",")[2].strip() if self._identity.count(",") >= 2 else ""
             refuse_another(name, settings.serial, self._serial)
             self._travel.refuse_narrower(*self._axis.own_limits(), advice="widen the travel range in the controller")
-        except BaseException:
-            self.close()
-            raise
 
     @staticmethod
     def halt(url: str, settings: PiGcsSettings, clock: Clock) -> None:
@@ -70,41 +59,41 @@ class PiGcsStage(LineStage):
         target = self._travel.target(angle)
         if not SLOWEST <= math.degrees(speed) <= math.degrees(self.limits.max_speed) * (1 + 1e-12):
             raise self._travel.no_such_speed(speed, f"{SLOWEST:g} deg/s or more")
-        with self._begin("the move"):
+        with self._stops.none_while("the move"):
             self._axis.standing("a move")
             self._refuse_untold()
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
                 self.disarm()
-            self._target, self._homing = None, False  # clear the earlier move: it is not the reason if this one fails
+            # Clear the earlier move: it is not the reason if this one fails.
+            self._target, self._searching = None, False
             self._axis.start(target, Fraction(speed) * self._per_radian)
             self._told = 0
             self._target = target
 
     def start_home(self) -> None:
         """Soft limits do not hold on the way. It ends an armed train."""
-        with self._begin("the reference move"):
+        with self._stops.none_while("the reference move"):
             self._axis.standing("a reference move")
-            self._train, self._target, self._homing = None, None, False
+            self._train, self._target, self._searching = None, None, False
             self._axis.search_reference(self._settings.reference.command)
-            self._homing = True
+            self._searching = True
 
     def moving(self) -> bool:
-        return self._axis.searching() if self._homing else self._axis.moving()
+        return self._axis.searching() if self._searching else self._axis.moving()
 
     def wait(self, timeout: float) -> float:
-        target, homing = self._target, self._homing
+        target, homing = self._target, self._searching
         if until_standing(self._clock, self.moving, bool, timeout):
-            aim = "" if target is None else self._travel.degrees(target)
-            raise self._travel.still_moving(timeout, self._axis.counts(), aim, self._axis.last_move)
+            raise self._travel.still_moving(timeout, self._axis.counts(), self._aim, self._axis.last_move)
         if target is not None:
             self._until_settled(target)
         status = self._axis.status()
         if homing and not status.homed:
             error = self._stopped_short("the reference move stopped short", status, "the reference found")
-            self._homing = False
+            self._searching = False
             raise error
         if homing:
-            self._homing = False
+            self._searching = False
         elif target is not None and (self._away(status.counts) or not status.servo):
             wanted = f"{self._travel.degrees(target)}, {target} counts"
             raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
@@ -140,7 +129,7 @@ class PiGcsStage(LineStage):
             "first_pulse": self._settings.first_pulse.value,
             "pulse_width_s": "fixed by the firmware",
             **({"serial": self._serial} if self._serial else {}),
-            **found_at_opening(meaning(self._axis.error_at_opening), self._axis.found.notice),
+            **found_at_opening(meaning(self._axis.error_at_opening), self._found.notice),
             **self._travel.described(),
         }
 
@@ -149,15 +138,9 @@ class PiGcsStage(LineStage):
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
         return GcsOutput(self._line, number, f"{self.name} output {number}")
 
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            with suppress(DeviceError):  # a dead line is closed, too
-                self._axis.restore()
-        self._line.close()
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        self._axis.found.keep_in(store)
+    def _release(self) -> None:
+        with closing(self._line):
+            self._axis.restore()
 
     def _refuse_untold(self) -> None:
         """DeviceError, once, for what happened to the standing axis since its last move."""
@@ -174,13 +157,6 @@ class PiGcsStage(LineStage):
             state=f"Nothing has moved by this; it stands at {self._travel.degrees(self._axis.counts())}",
         )
 
-    @contextmanager
-    def _begin(self, purpose: str) -> Iterator[None]:
-        """Context around the commands that begin a move; a stop meanwhile wins."""
-        self._stops_before = self._stops.count
-        with self._stops.none_while(purpose):
-            yield
-
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop_all() if hard else self._axis.brake()
 
@@ -196,10 +172,10 @@ class PiGcsStage(LineStage):
     def _fault(self, status: PiAxisStatus) -> str:
         """Why the last move ended early, or what stands, in words; "" for nothing."""
         code, words = self._line.fault, []
-        early = self._away(status.counts) or (self._homing and not status.homed)
+        early = self._away(status.counts) or (self._searching and not status.homed)
         if code and code != STOPPED:
             words.append(meaning(code))
-        elif early and (code == STOPPED or self._stops.count != self._stops_before):
+        elif early and (code == STOPPED or self._stops.came_since):
             words.append(meaning(STOPPED))
         elif early:
             words.append(self._axis.limit_switch() or "no reason given")

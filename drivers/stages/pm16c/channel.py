@@ -1,21 +1,95 @@
 """One motor channel of a Tsuji PM16C-04XD(L) in the controller's own units: pulses, pulses/s, codes, and its replies.
 
 Protocol: the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Set commands have no reply,
-so each important one is read back.
+so each important one is read back. A controller that writes its memory takes its time: KEK's driver waits 40 ms after
+settings. So a wrong read-back is repeated for a while, and the setting then sent once more; only then it is refused.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.stages.kept import FoundSettings
-from drivers.stages.pm16c.line import PM16CLine
+from drivers.serial.line import Probe
 from drivers.stages.pm16c.settings import TriggerPoints
 from drivers.stages.settings import Wiring
-from drivers.stages.shared import while_it_moves
+from drivers.stages.shared import FoundSettings, line_to, while_it_moves
+
+PROBE = Probe("STQ?", r"[RL][0-4]")
+STOPPED_NOTE = r"STOP[0-9A-F]"
+MEMORY = 0.12  # Longest time, s, until a setting takes effect
+LOOK = 0.02  # s between two checks of this
+T = TypeVar("T")
+
+
+class PM16CLine:
+    """Raises (in all methods):
+    DeviceError: a wrong reply or read-back. DeviceTimeout: no reply.
+    """
+
+    def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:
+        self.commanded = False
+        """Whether a move has started; the text of an error depends on it."""
+        self._name, self._clock = name, clock
+        self._serial = line_to(wiring, url, name, clock, PROBE, unsolicited=STOPPED_NOTE)
+
+    def send(self, command: str) -> None:
+        """Send a command without waiting."""
+        self._serial.send(command)
+
+    def ask(self, request: str, form: str, meaning: str) -> re.Match[str]:
+        state = "A move was started before; the stage may be turning" if self.commanded else "Nothing has moved"
+        return self._serial.query(request, form, meaning, state)
+
+    def set(self, command: str, query: str, value: int) -> None:
+        """Send a numeric setting and read it back."""
+        self.make_sure(command, query, r"[+-]?\d+", value, int)
+
+    def make_ready(self, command: str, query: str, wanted: str) -> None:
+        """Arm or disarm the trigger output and check it."""
+        self.make_sure(command, query, "YES|NO", wanted, str)
+
+    def make_sure(self, command: str, query: str, form: str, wanted: T, read: Callable[[str], T]) -> None:
+        """Send a setting and check that the reply to `query`, of the form `form`, reads `wanted`."""
+        for _ in range(2):
+            self.send(command)
+            value = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
+            if value == wanted:
+                return
+        raise self.not_followed(command, str(value), str(wanted))
+
+    def until(self, look: Callable[[], T], good: Callable[[T], bool]) -> T:
+        """The first good reply, or the last one within the time for a setting to take effect."""
+        deadline = self._clock.now() + MEMORY
+        while not good(seen := look()) and self._clock.now() < deadline:
+            self._clock.sleep(LOOK)
+        return seen
+
+    def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
+        """The error for a read-back that is not what was set."""
+        return DeviceError(
+            self._name,
+            f"a setting was not taken ({self.complaint()})",
+            request=command,
+            reply=reply,
+            expected=wanted,
+            advice="Check that no other program or person drives this controller",
+            state="Nothing has moved",
+        )
+
+    def complaint(self) -> str:
+        """Read and clear the controller's own error text."""
+        text = self.ask("ERR?", r".*", "an error text")[0]
+        self.send("ERRC")
+        return f"the controller says {text}"
+
+    def close(self) -> None:
+        self._serial.close()
+
 
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)  # Firmware
@@ -230,61 +304,3 @@ class PM16CChannel:
                 advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
                 state=f"The stage stands at {status.counts} counts",
             )
-
-
-class HomeSearch:
-    """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
-
-    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
-    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
-    speed is the selected one. A search that has found the switch may end some counts beyond it.
-
-    Args:
-        home: the count that the reference gets.
-    """
-
-    def __init__(self, channel: PM16CChannel, name: str, home: int) -> None:
-        self._channel, self._name, self._home = channel, name, home
-        self._found: int | None = None
-        self._cancelled = False
-
-    def begin(self, speed: int) -> None:
-        """Start to search at `speed` pulses/s."""
-        self._channel.find_home(speed)
-
-    def cancel(self) -> None:
-        """End the search: no further step. Call it before the stop is sent, from any thread."""
-        self._cancelled = True
-
-    def go_on(self, status: ChannelStatus) -> bool:
-        """Take the next step after the motor has come to rest; False if there is none.
-
-        Raises:
-            DeviceError: the search ended without the switch, or was stopped.
-        """
-        home = self._channel.home() if self._found is None else self._found
-        if home is None or self._cancelled or status.stopped:
-            raise self._failed(status)
-        if self._found is None and status.counts != home:
-            self._found = home
-            try:
-                self._channel.go_home(home)
-            finally:
-                if self._cancelled:  # the stop may have gone out just before the move
-                    self._channel.stop(hard=False)
-            return True
-        if status.counts != home:
-            raise self._failed(status)
-        self._channel.preset(self._home)
-        return False
-
-    def _failed(self, status: ChannelStatus) -> DeviceError:
-        why = status.ending or ("stopped" if self._cancelled else "no reason given")
-        return DeviceError(
-            self._name,
-            f"the search for the home switch stopped short ({why})",
-            reply=status.raw,
-            expected="to stand on the home switch",
-            advice="Check the switch and its settings on the controller's panel, then search again",
-            state=f"It stands at {status.counts} counts, which are not those of the reference",
-        )

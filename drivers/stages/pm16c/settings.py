@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits, TriggerTrain
+from drivers.flat import Declared
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.travel import counts_in
 
@@ -96,7 +97,7 @@ def steepest_code(acceleration: float) -> int:
 
 
 @dataclass(frozen=True)
-class PM16CSettings:
+class PM16CSettings(Declared):
     """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
 
     Raises:
@@ -117,8 +118,7 @@ class PM16CSettings:
     home_speed: float | None = key(None, "For the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.channel <= 15:
-            raise ValueError(f"channel {self.channel} does not exist; expected 0 to 15")
+        super().__post_init__()
         if not self.wiring.active_high:
             raise ValueError("active_high cannot be false: the PM16C's trigger output has one polarity")
         if self.home is not None and not abs(self.home) * self.figures.per_radian <= MAX_COUNT:

@@ -12,11 +12,67 @@ import math
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, TriggerTrain
-from drivers.stages.kept import SettingsStore
-from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
+from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 from drivers.stages.pm16c.settings import MODES, PM16CSettings, points_of
-from drivers.stages.shared import LineStage, Stops, found_at_opening, until_standing
-from drivers.stages.travel import Travel
+from drivers.stages.shared import LineStage, found_at_opening, until_standing
+
+
+class HomeSearch:
+    """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
+
+    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
+    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
+    speed is the selected one. A search that has found the switch may end some counts beyond it.
+
+    Args:
+        home: the count that the reference gets.
+    """
+
+    def __init__(self, channel: PM16CChannel, name: str, home: int) -> None:
+        self._channel, self._name, self._home = channel, name, home
+        self._found: int | None = None
+        self._cancelled = False
+
+    def begin(self, speed: int) -> None:
+        """Start to search at `speed` pulses/s."""
+        self._channel.find_home(speed)
+
+    def cancel(self) -> None:
+        """End the search: no further step. Call it before the stop is sent, from any thread."""
+        self._cancelled = True
+
+    def go_on(self, status: ChannelStatus) -> bool:
+        """Take the next step after the motor has come to rest; False if there is none.
+
+        Raises:
+            DeviceError: the search ended without the switch, or was stopped.
+        """
+        home = self._channel.home() if self._found is None else self._found
+        if home is None or self._cancelled or status.stopped:
+            raise self._failed(status)
+        if self._found is None and status.counts != home:
+            self._found = home
+            try:
+                self._channel.go_home(home)
+            finally:
+                if self._cancelled:  # the stop may have gone out just before the move
+                    self._channel.stop(hard=False)
+            return True
+        if status.counts != home:
+            raise self._failed(status)
+        self._channel.preset(self._home)
+        return False
+
+    def _failed(self, status: ChannelStatus) -> DeviceError:
+        why = status.ending or ("stopped" if self._cancelled else "no reason given")
+        return DeviceError(
+            self._name,
+            f"the search for the home switch stopped short ({why})",
+            reply=status.raw,
+            expected="to stand on the home switch",
+            advice="Check the switch and its settings on the controller's panel, then search again",
+            state=f"It stands at {status.counts} counts, which are not those of the reference",
+        )
 
 
 class PM16CStage(LineStage):
@@ -30,23 +86,16 @@ class PM16CStage(LineStage):
     Settings = PM16CSettings
 
     def __init__(self, url: str, settings: PM16CSettings, clock: Clock, name: str = "stage") -> None:
-        self.name = name
-        self._clock, self._url, self._settings = clock, url, settings
-        self._travel = Travel(name, settings.limits())
-        self._fastest = settings.fastest
+        super().__init__(url, settings, clock, name)
+        self._settings = settings
         self._home = None if settings.home is None else self._travel.to_counts(settings.home)
-        self._target: int | None = None
         self._search: HomeSearch | None = None
-        self._closed = False
-        self._stops = Stops(name, self._send_stop)
         self._channel = PM16CChannel(url, settings.channel, settings.wiring, clock, name)
-        try:
+        self._found = self._channel.found
+        with self._closed_on_failure():
             self._version = self._channel.open(settings.rate_code)
             if (own := self._channel.own_limits()) is not None:
                 self._travel.refuse_narrower(*own, advice="widen the limits on the controller's panel")
-        except BaseException:
-            self.close()
-            raise
 
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
@@ -57,7 +106,8 @@ class PM16CStage(LineStage):
         return self._channel.counts()
 
     def start_move(self, angle: float, speed: float) -> None:
-        target, pps = self._travel.target(angle), self._pps(speed)
+        target, per_radian = self._travel.target(angle), self.limits.counts_per_turn / (2 * math.pi)
+        pps = self._travel.native(speed, per_radian, self._settings.fastest, "pulses/s")
         with self._stops.none_while("the move"):
             self._channel.start(target, pps)
         self._target, self._search = target, None
@@ -88,8 +138,7 @@ class PM16CStage(LineStage):
                 self._search = search = None
             status = self._until_standing(deadline - self._clock.now())
         if status.moving:
-            aim = "" if target is None else self._travel.degrees(target)
-            raise self._travel.still_moving(timeout, status.counts, aim, self._channel.last_move, status.raw)
+            raise self._travel.still_moving(timeout, status.counts, self._aim, self._channel.last_move, status.raw)
         if target is not None and status.counts != target:
             raise DeviceError(
                 self.name,
@@ -121,18 +170,12 @@ class PM16CStage(LineStage):
             "pulse_width_s": self._settings.widths.chosen or "the widest that fits",
             "trigger_polarity": "active high",
             "first_pulse": self._settings.first_pulse.value,
-            **found_at_opening(self._channel.error_at_opening, self._channel.found.notice),
+            **found_at_opening(self._channel.error_at_opening, self._found.notice),
             **self._travel.described(),
         }
 
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            with contextlib.suppress(DeviceError):  # a dead line is closed, too
-                self._channel.close()
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        self._channel.found.keep_in(store)
+    def _release(self) -> None:
+        self._channel.close()
 
     def _send_stop(self, hard: bool) -> str:
         if (search := self._search) is not None:
@@ -146,14 +189,6 @@ class PM16CStage(LineStage):
             advice="Set shutter.kind: manual, or use the output of another controller",
             state="Nothing was sent",
         )
-
-    def _pps(self, speed: float) -> int:
-        """Pulses/s for rad/s."""
-        possible = 0 < speed < 2 * self.limits.max_speed
-        pps = round(speed * self.limits.counts_per_turn / (2 * math.pi)) if possible else 0
-        if not 1 <= pps <= self._fastest:
-            raise self._travel.no_such_speed(speed, f"1 to {self._fastest} pulses/s")
-        return pps
 
     def _until_standing(self, timeout: float) -> ChannelStatus:
         """The status once the stage stands, or when the time is over."""

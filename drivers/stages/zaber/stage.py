@@ -14,13 +14,11 @@ from dataclasses import replace
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.kept import SettingsStore
-from drivers.stages.shared import LineStage, Stops, found_at_opening, refuse_another, until_standing
+from drivers.stages.shared import LineStage, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
-from drivers.stages.zaber.settings import ZaberSettings
-from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
+from drivers.stages.zaber.settings import PulseSettings, ZaberSettings, has_started, remaining, set_up
 
 ADVICE = (
     "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
@@ -128,28 +126,19 @@ class ZaberStage(LineStage):
     Settings = ZaberSettings
 
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
-        self.name = name
-        self._clock, self._url, self._settings = clock, url, settings
-        self._fastest, steepest = settings.native_limits
-        self._travel = Travel(name, settings.limits())
-        self._target: int | None = None
-        self._homing = False
+        super().__init__(url, settings, clock, name)
+        self._settings, (self._fastest, steepest) = settings, settings.native_limits
         self._told = frozenset[str]()  # flags that an error, or the description, has told
-        self._closed = False
-        self._stops = Stops(name, self._send_stop)
         self._axis = ZaberAxis(url, settings, clock, name)
-        self._pulses = ZaberPulses(self._axis, settings.pulses, name)
-        try:
+        self._found, self._pulses = self._axis.found, ZaberPulses(self._axis, settings.pulses, name)
+        with self._closed_on_failure():
             self._identity = self._axis.open()
-            self._refuse_another_device()
+            refuse_another(name, settings.serial, self._identity.serial)
             self._told = frozenset(self._axis.flags_at_opening)
             self._check_turn_and_travel()
             self._axis.set("accel", steepest)
             if self._identity.has_triggers:
                 self._pulses.disarm()  # a train left by a program that died
-        except BaseException:
-            self.close()
-            raise
         self._travel = Travel(name, replace(settings.limits(), trigger_output=self._identity.has_triggers))
 
     @staticmethod
@@ -167,9 +156,7 @@ class ZaberStage(LineStage):
         """`stops`: number of stops before; a later one wins."""
         target = self._travel.target(angle)
         per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._settings.speed_unit
-        native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
-        if not 1 <= native <= self._fastest:
-            raise self._travel.no_such_speed(speed, f"native 1 to {self._fastest}")
+        native = self._travel.native(speed, per_radian, self._fastest, "native units")
         with self._stops.none_while("the move", stops):
             status = self._axis.standing("a move")
             if not status.referenced:
@@ -185,7 +172,7 @@ class ZaberStage(LineStage):
             self._forget_flags(status)
             self._axis.set("maxspeed", native)
             self._axis.move(target)
-        self._target, self._homing = target, False
+        self._target, self._searching = target, False
 
     def start_home(self) -> None:
         """Begin the search, at the controller's own speed and acceleration for it."""
@@ -194,18 +181,18 @@ class ZaberStage(LineStage):
             self.disarm()
             self._forget_flags(status)
             self._axis.home()
-        self._target, self._homing = None, True
+        self._target, self._searching = None, True
 
     def moving(self) -> bool:
         return self._axis.status().moving
 
     def wait(self, timeout: float) -> float:
         status = until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)
-        aim = "its reference" if self._homing else "" if self._target is None else self._travel.degrees(self._target)
+        aim = self._aim
         if status.moving:
             raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
         fault = meaning_of(status.flags)
-        if self._homing:
+        if self._searching:
             arrived = status.referenced and INTERRUPTED not in status.flags
         else:
             arrived = self._target is None or status.counts == self._target
@@ -221,7 +208,7 @@ class ZaberStage(LineStage):
                 state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts: "
                 + ("no reason given" if fault is None else fault.text),
             )
-        self._homing = False
+        self._searching = False
         return self.to_angle(status.counts)
 
     def arm(self, train: TriggerTrain) -> None:
@@ -255,7 +242,7 @@ class ZaberStage(LineStage):
             "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
             "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
             "pulse_active_high": int(pulses.active_high),
-            **found_at_opening("" if flags is None else flags.text, self._axis.found.notice),
+            **found_at_opening("" if flags is None else flags.text, self._found.notice),
             **self._travel.described(),
         }
 
@@ -264,16 +251,10 @@ class ZaberStage(LineStage):
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
         return ZaberOutput(self._axis, number, f"{self.name} output {number}")
 
-    def close(self) -> None:
-        if not self._closed:
-            self._closed = True
-            with contextlib.suppress(DeviceError):  # a dead line is closed, too
-                self.disarm()
-            with contextlib.suppress(DeviceError):
-                self._axis.close()
-
-    def keep_found_settings(self, store: SettingsStore) -> None:
-        self._axis.found.keep_in(store)
+    def _release(self) -> None:
+        with contextlib.suppress(DeviceError):
+            self.disarm()
+        self._axis.close()
 
     def _refuse_untold(self, status: ZaberAxisStatus) -> None:
         """DeviceError, once, for what happened to the standing stage since its last move."""
@@ -295,9 +276,6 @@ class ZaberStage(LineStage):
         if status.flags:
             self._axis.forget_flags()
         self._told = frozenset()
-
-    def _refuse_another_device(self) -> None:
-        refuse_another(self.name, self._settings.serial, self._identity.serial)
 
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop("estop" if hard else "stop")

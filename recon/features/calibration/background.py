@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from recon.base.arrays import F32, F64, Mask, median_deviation
-from recon.base.binning import bin_views, factor_within
+from recon.base.arrays import F32, F64, Mask, bin_views, factor_within, median_deviation
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.views import spread
@@ -31,7 +30,7 @@ from recon.prep.background import LEAST_SIZE, coordinate, powers
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.voxel_problem import density_unit
 

@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from recon.base.arrays import F32, F64
-from recon.base.binning import bin_views
+from recon.base.arrays import F32, F64, bin_views
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
-from recon.features.calibration.freedom import TERMS, GeometryChange, edge_motion
-from recon.features.calibration.joint import JointFit, taller
+from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
 from recon.voxels.held_out import beyond_chance
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 
 _ONE_IN = 4  # views held out

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import Lengths, MethodEntry
+from recon.base.registry import Lengths, MethodEntry
 
 METHODS = {
     "sirt": MethodEntry(
-        "recon.features.iterative.sirt", "Sirt", lengths=Lengths("iterations", (60, 20), (100, 10, 30, 300))
+        "recon.features.iterative.methods", "Sirt", lengths=Lengths("iterations", (60, 20), (100, 10, 30, 300))
     ),
-    "sart": MethodEntry("recon.features.iterative.sart", "Sart", lengths=Lengths("iterations", (6, 2), (10, 1, 3, 30))),
+    "sart": MethodEntry(
+        "recon.features.iterative.methods", "Sart", lengths=Lengths("iterations", (6, 2), (10, 1, 3, 30))
+    ),
     "cgls": MethodEntry(
-        "recon.features.iterative.cgls", "Cgls", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
+        "recon.features.iterative.methods", "Cgls", lengths=Lengths("iterations", (15, 5), (20, 5, 10, 40))
     ),
     "asd-pocs": MethodEntry(
-        "recon.features.iterative.asd_pocs", "AsdPocs", lengths=Lengths("iterations", (10,), (20, 5, 50))
+        "recon.features.iterative.methods", "AsdPocs", lengths=Lengths("iterations", (10,), (20, 5, 50))
     ),
 }

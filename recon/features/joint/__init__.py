@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import MethodEntry
+from recon.base.registry import MethodEntry
 
 METHODS = {
     "series": MethodEntry("recon.features.joint.methods", "TimeSeries", compared=False, several="times"),
     "materials": MethodEntry("recon.features.joint.methods", "EnergySeries", compared=False, several="materials"),
 }
 
-OPERATIONS = {"series": "recon.features.joint.speed"}
+OPERATIONS = {"series": "recon.features.joint.methods"}

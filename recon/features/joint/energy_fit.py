@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
-from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
+from recon.base.declared_types import check_settings
+from recon.base.geometry import Geometry, require_views
 from recon.base.volume import Grid
 from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.held_out import busiest_rows, slab_of
+from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector, projection_lines
-from recon.voxels.tv import TotalVariationProx, difference_weights
-from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
+from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
 _ROUNDS = 6  # of power iteration
@@ -66,17 +66,17 @@ class EnergyViews:
 
     def __post_init__(self) -> None:
         check_settings(self)
-        wanted = (self.geometry.n_views, *self.geometry.detector_shape)
-        for name, array in (("projections", self.projections), ("weight", self.weight)):
-            if array is not None and array.shape != wanted:
-                raise ValueError(f"{name} must have the geometry's shape {wanted}, got {array.shape}")
+        require_views(self.geometry, self.projections)
+        if self.weight is not None:
+            require_views(self.geometry, self.weight, "weights")
         if not np.isfinite(self.projections).all():
             raise ValueError("projections must be finite: give rays that were not measured the weight 0 and any value")
         if self.cross_sections.ndim != 2:
             raise ValueError(f"cross_sections must be [energy, material], got shape {self.cross_sections.shape}")
         n = len(self.cross_sections)
-        if self.energy.shape != wanted[:1] or self.energy.min() < 0 or self.energy.max() >= n:
-            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {wanted[0]} views")
+        views = self.geometry.n_views
+        if self.energy.shape != (views,) or self.energy.min() < 0 or self.energy.max() >= n:
+            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {views} views")
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
@@ -99,6 +99,14 @@ class EnergyViews:
             own = np.flatnonzero(group == number)
             part[own[np.argsort(angles[own], kind="stable")]] = (number * n // groups + np.arange(own.size)) % n
         return part
+
+
+def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid]:
+    """So many rows with most matter, for trials, and their slices; all where rows do not show slices."""
+    if not views.geometry.rows_show_slices:
+        return slice(None), grid
+    rows = busiest_rows(views.projections, height)
+    return rows, slab_of(views.geometry, grid, rows.start, rows.stop)[1]
 
 
 class _StoppedError(Exception):

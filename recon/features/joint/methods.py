@@ -5,20 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from functools import partial
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
 from recon.base.arrays import F32
+from recon.base.declared_types import Bound, Checked, Count, NonNegative, check_settings
 from recon.base.geometry import Geometry
 from recon.base.method import Energies, Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume, VolumeSeries
-from recon.base.work import Costs, Work
-from recon.features.joint.energy_fit import EnergyViews
-from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS
-from recon.features.joint.series import SWEEPS, TimedViews, fit_series, series_costs
-from recon.features.joint.share_fit import STEPS, fit_share
+from recon.base.work import Costs, SizedRun, Work
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews
+from recon.features.joint.motion import Motion
+from recon.features.joint.proportions import SOLUTION_STEPS, STEPS, TRIAL_STEPS, fit_share
+from recon.features.joint.series import MOMENTS, SWEEPS, TimedViews, fit_series, of_moments, series_costs
 from recon.features.joint.spectral import MATERIAL_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, fit_materials
 
 _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each of the result; for displacements and what they displace
@@ -27,7 +28,7 @@ _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned vi
 
 
 @dataclass(frozen=True)
-class TimeSeries:
+class TimeSeries(Checked):
     """Volumes at even times of one scan of a sample that changes, see `fit_series`.
 
     Attributes:
@@ -44,13 +45,10 @@ class TimeSeries:
     label: ClassVar[str] = "Volumes in time"
     traits: ClassVar[Traits] = Traits(in_time=True)
 
-    volumes: int = 2
+    volumes: Annotated[int, Bound(2)] = 2
     moves: bool | None = None
-    sweeps: int = SWEEPS
-    weight: float | None = None
-
-    def __post_init__(self) -> None:
-        check_settings(self, whole={"volumes": 2, "sweeps": 1}, least={"weight": 0.0})
+    sweeps: Count = SWEEPS
+    weight: NonNegative | None = None
 
     @property
     def volume_names(self) -> tuple[str, ...]:
@@ -112,11 +110,11 @@ class EnergySeries:
 
     materials: tuple[str, ...] = ("matter",)
     states: tuple[str, ...] = ()
-    sweeps: int = MATERIAL_SWEEPS
-    weight: float | None = None
+    sweeps: Count = MATERIAL_SWEEPS
+    weight: NonNegative | None = None
 
     def __post_init__(self) -> None:
-        check_settings(self, whole={"sweeps": 1}, least={"weight": 0.0})
+        check_settings(self)
         object.__setattr__(self, "materials", tuple(self.materials))
         object.__setattr__(self, "states", tuple(self.states))
         if not self.materials or len(set(self.materials)) < len(self.materials):
@@ -229,8 +227,7 @@ class _History:
 
     def _tell(self, reached: Progress) -> Progress:
         now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        if self.control.on_progress is not None:
-            self.control.on_progress(now)
+        self.control.tell(now)
         return now
 
     def result(
@@ -278,3 +275,28 @@ def _because(still: float, moved: float, moves: bool) -> str:
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"
     return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+
+
+def timed(which: str) -> tuple[SizedRun, ...]:
+    """Sweeps of so many volumes, as of "moving 3"."""
+    from recon.machine_speed import views_of_disc
+
+    kind, count = which.split()
+    volumes, sized = int(count), list[SizedRun]()
+    for cols in (32, 80):
+        geometry, grid, data = views_of_disc("parallel", 16, cols, 12 * volumes)
+        n, motion = geometry.n_views, None
+        if kind == "energies":
+            views = EnergyViews(data, geometry, np.arange(n) * volumes // n, np.eye(volumes) + 0.5)
+        else:
+            times, (nz, ny, nx) = np.arange(n, dtype=np.float64), grid.shape
+            knots = np.linspace(0, times[-1], volumes)
+            views, past = of_moments(TimedViews(data, geometry, times), knots, MOMENTS * (volumes - 1))
+            motion = Motion.none((ny, nx, nz), past, 3, 3) if kind == "moving" else None
+        fit = EnergyFit(views, grid, np.random.default_rng(0), motion)
+        sized.append(SizedRun(n, n * math.prod(grid.shape), partial(_sweep, fit, volumes)))
+    return tuple(sized)
+
+
+def _sweep(fit: EnergyFit, volumes: int) -> None:
+    list(fit.sweeps(np.full(volumes, 0.1), 1))

@@ -12,12 +12,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.kernels.cpu.warp import pull, push, slopes
 from recon.voxels.projector import Projector
+
+A = TypeVar("A", F32, F64)
 
 MIDDLE = 0.5  # of the scan: u is 0
 _STEPS = 8  # of conjugate gradients
@@ -130,7 +133,8 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
     def normal(control: F64) -> F64:
         return curved(control) + typical * _rough(control)
 
-    step = _solved(normal, right - typical * _rough(motion.control))
+    step = np.zeros_like(right)  # a few steps find the large motions first
+    conjugate_gradients(normal, right - typical * _rough(motion.control), step, _STEPS)
     return Motion(motion.shape, motion.times, motion.control + step)
 
 
@@ -149,20 +153,26 @@ def _rough(control: F64) -> F64:
     return out
 
 
-def _solved(normal: Callable[[F64], F64], right: F64) -> F64:
-    """Conjugate gradients (Hestenes & Stiefel 1952) from 0, a few steps: they find the large motions first."""
-    found, left = np.zeros_like(right), right.copy()
+def conjugate_gradients(
+    normal: Callable[[A], A], left: A, found: A, steps: int, go_on: Callable[[], bool] = lambda: True
+) -> None:
+    """Steps of conjugate gradients (Hestenes & Stiefel 1952), which improve `found` in place.
+
+    Args:
+        left: the right side less `normal` of what was found so far; overwritten.
+        go_on: asked before each step. False ends it.
+    """
+    of_kind = found.dtype.type
     towards, squares = left.copy(), float(np.vdot(left, left))
-    for _ in range(_STEPS):
-        if squares == 0:
+    for _ in range(steps):
+        if squares == 0 or not go_on():
             break
         image = normal(towards)
-        length = squares / float(np.vdot(towards, image))
+        length = of_kind(squares / float(np.vdot(towards, image)))
         found += length * towards
         left -= length * image
         before, squares = squares, float(np.vdot(left, left))
-        towards = left + squares / before * towards
-    return found
+        towards = left + of_kind(squares / before) * towards
 
 
 def moved(x: F32, u: F32 | None) -> F32:

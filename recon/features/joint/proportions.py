@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.voxels.projector import Projector
+from recon.base.declared_types import check_arguments
+from recon.base.empirical import ONE_IN
+from recon.base.volume import Grid
+from recon.features.joint.energy_fit import EnergyViews, trial_rows
+from recon.features.joint.motion import conjugate_gradients
+from recon.features.joint.spectral import Materials
+from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 _HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9  # first λ over the mean curvature of the views; its ratio to the next
 _IN_TIME = 0.03  # τ
@@ -134,7 +140,7 @@ class Proportions:
         return np.ones((self.shares.shape[1], *self.matter.shape), np.float32)
 
     def solved(self, smooth: float, factors: F32, go_on: Callable[[], bool], steps: int = SOLUTION_STEPS) -> F32:
-        """Steps of conjugate gradients (Hestenes & Stiefel 1952) from first factors.
+        """Steps of conjugate gradients from first factors.
 
         Args:
             smooth: λ over the mean curvature of the views.
@@ -148,17 +154,7 @@ class Proportions:
             def normal(of: F32) -> F32:
                 return self.explained(self.shown(of)) + weight * self.rough(of)
 
-            left = self.explained(self.data) - normal(found)
-            towards, squares = left.copy(), float(np.vdot(left, left))
-            for _ in range(steps):
-                if squares == 0 or not go_on():
-                    break
-                image = normal(towards)
-                length = np.float32(squares / float(np.vdot(towards, image)))
-                found += length * towards
-                left -= length * image
-                before, squares = squares, float(np.vdot(left, left))
-                towards = left + np.float32(squares / before) * towards
+            conjugate_gradients(normal, self.explained(self.data) - normal(found), found, steps, go_on)
         return found
 
 
@@ -186,3 +182,82 @@ def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable
         if apart.sum() <= math.sqrt(apart.size) * apart.std(ddof=min(1, apart.size - 1)):
             return smooth, float(left.sum())
     return _HEAVIEST, math.inf
+
+
+_ROWS, _DEEPEST = 16, 7.0  # of trials; line integral from which on rays weigh alike
+STEPS = TRIAL_STEPS + SOLUTION_STEPS
+
+
+def fit_share(
+    views: EnergyViews,
+    found: Materials,
+    states: tuple[int, int],
+    go_on: Callable[[int], bool] = lambda left: True,
+    stop: Callable[[], bool] = lambda: False,
+) -> Materials:
+    """Densities of two states of one material anew: the same sum, with the share of each smooth within matter.
+
+    Views held out, one in eight of some rows, choose how smooth. Memory: ten volumes, six times the projections.
+
+    Args:
+        found: of `fit_materials`, from the same views.
+        states: indices of the two materials.
+        go_on: called before each of `STEPS` steps at most, with how many may follow. False ends it, with the densities
+            found before.
+        stop: asked many times within a step. True ends it likewise.
+
+    Raises:
+        ValueError: states that are no two materials.
+    """
+    check_arguments(fit_share, locals())
+    count = len(found.densities)
+    if len(set(states)) != 2 or not set(states) <= set(range(count)):
+        raise ValueError(f"states must be two of the materials 0 ... {count - 1}, got {states}")
+    steps = Countdown(go_on, STEPS, stop)
+    smooth = _smoothness(views, found, states, steps)
+    steps.left = min(steps.left, SOLUTION_STEPS)
+    problem = share_problem(views, found.densities, states, found.grid)
+    share = _even(problem)
+    share = np.clip(volume_slices(replace(problem, stop=stop).solved(smooth, share, steps)[0]), 0, 1)
+    if not steps.going or stop():
+        return found
+    densities, total = found.densities.copy(), found.densities[list(states)].sum(0)
+    densities[states[0]], densities[states[1]] = total * (1 - share), total * share
+    return replace(found, densities=densities)
+
+
+def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], grid: Grid) -> Proportions:
+    """Each ray weighs as many photons as the densities let through, which is one over the variance of its noise."""
+    projector, sections = Projector(views.geometry, grid), views.cross_sections
+    of_view = sections[views.energy].astype(np.float32)[:, :, None, None]
+    data = projection_lines(views.projections)
+    depth = np.zeros_like(data)
+    for material, density in enumerate(densities):
+        seen = projector.forward_lines(volume_lines(density))
+        depth += of_view[:, material] * seen
+        data = data - of_view[:, states[0] if material in states else material] * seen
+    weight = np.exp(-np.minimum(depth, _DEEPEST))
+    if views.weight is not None:
+        weight[projection_lines(views.weight) == 0] = 0
+    difference = sections[:, [states[1]]] - sections[:, [states[0]]]
+    return Proportions(projector, views.energy, difference, volume_lines(densities[list(states)].sum(0)), data, weight)
+
+
+def _even(problem: Proportions) -> F32:
+    """One share for all matter, the best in the mean of the views."""
+    one = problem.ones()
+    all_explained = float(problem.explained(problem.shown(one)).sum(dtype=np.float64))
+    mean = float(problem.explained(problem.data).sum(dtype=np.float64)) / (all_explained or 1)
+    return np.float32(np.clip(mean, 0, 1)) * one
+
+
+def _smoothness(views: EnergyViews, found: Materials, states: tuple[int, int], steps: Countdown) -> float:
+    rows, grid = slice(None), found.grid
+    if grid.shape[0] == views.geometry.detector_shape[0]:
+        rows, grid = trial_rows(views, grid, _ROWS)
+    some = views.select(np.arange(views.geometry.n_views), rows)
+    problem = share_problem(some, found.densities[:, rows], states, grid)
+    held_out = views.parted(ONE_IN) == ONE_IN // 2
+    first, problem = _even(problem), replace(problem, stop=steps.stop)
+    fit, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
+    return smoothness(fit, judge, first, steps)[0]

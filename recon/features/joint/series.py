@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
-from recon.base.declared_types import check_arguments
+from recon.base.declared_types import check_arguments, check_settings
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.settings_check import check_settings
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.base.work import Costs, Work
-from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 from recon.features.joint.learnt_motion import (
     JUDGED,
     JUDGED_SWEEPS,
@@ -34,7 +33,7 @@ from recon.features.joint.learnt_motion import (
 from recon.features.joint.motion import Motion, moved
 from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.features.joint.spectral import weight_of, weights_by_views
-from recon.voxels.held_out import beyond_chance, busiest_rows, slab_of
+from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
@@ -252,10 +251,7 @@ def smooth_factors(
 
     Of some rows, from seven of eight views.
     """
-    rows, n_rows = slice(None), views.geometry.detector_shape[0]
-    if views.geometry.rows_show_slices:
-        rows = busiest_rows(views.projections, _ROWS)
-        grid = slab_of(views.geometry, grid, *rows.indices(n_rows)[:2])[1]
+    rows, grid = trial_rows(views, grid, _ROWS)
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
     going = True

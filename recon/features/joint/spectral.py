@@ -18,8 +18,7 @@ from recon.base.declared_types import check_arguments
 from recon.base.empirical import ONE_IN
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
-from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.voxels.held_out import busiest_rows, slab_of
+from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, trial_rows
 
 TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray
@@ -195,10 +194,7 @@ def weights_by_views(
         alike: all components keep one weight.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
-    rows = slice(None)
-    if views.geometry.rows_show_slices:
-        rows = busiest_rows(views.projections, TRIAL_ROWS)
-        grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
+    rows, grid = trial_rows(views, grid, TRIAL_ROWS)
     fit, judge = (
         EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop=stop)
         for chosen in (~held_out, held_out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import Lengths, MethodEntry
+from recon.base.registry import Lengths, MethodEntry
 
 _LENGTHS = Lengths("steps", (300,), (1000, 3000))
 METHODS = {
@@ -11,4 +11,4 @@ METHODS = {
     "sax-nerf": MethodEntry("recon.features.neural.methods", "SaxNerf", compared=False, lengths=_LENGTHS),
 }
 
-OPERATIONS = {"field": "recon.features.neural.speed"}
+OPERATIONS = {"field": "recon.features.neural.methods"}

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
-from recon.base.settings_check import check_settings
+from recon.base.declared_types import Bound, Count, Natural
+from recon.base.work import SizedRun
 from recon.features.neural.networks import Field, HashGrid, Waves
 from recon.features.neural.train import FieldMethod
+from recon.methods import by_name, with_settings
+from recon.reconstruction import reconstruct
 
 _COARSEST = 16  # cubes an edge of the first level
 
@@ -29,12 +33,8 @@ class _HashField(FieldMethod):
         log2_table: logarithm of the most entries of a level.
     """
 
-    levels: int | None = None
-    log2_table: int = 19
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"levels": (1, 16), "log2_table": (8, 24)})
+    levels: Annotated[int, Bound(1, 16)] | None = None
+    log2_table: Annotated[int, Bound(8, 24)] = 19
 
     def grid_of(self, across: int) -> HashGrid:
         to_voxels = 1 + max(0, math.ceil(math.log2(across / _COARSEST)))
@@ -67,12 +67,8 @@ class SaxNerf(_HashField):
     name: ClassVar[str] = "sax-nerf"
     label: ClassVar[str] = "SAX-NeRF"
 
-    window_count: int = 16
-    window_side: int = 8
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"window_count": 0, "window_side": 1})
+    window_count: Natural = 16
+    window_side: Count = 8
 
     @property
     def windows(self) -> tuple[int, int]:
@@ -97,12 +93,22 @@ class IntraTomo(FieldMethod):
 
     rate: float = 3e-3
     width: int = 128
-    bands: int = 6
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_settings(self, whole={"bands": 1})
+    bands: Count = 6
 
     def network(self, across: int) -> Field:
         highest = None if self.allow_negative else self.highest
         return Field(Waves(self.bands), self.width, waves=True, attention=False, highest=highest)
+
+
+def timed(which: str) -> tuple[SizedRun, ...]:
+    """Steps of the method of this name."""
+    from recon.machine_speed import views_of_disc
+
+    geometry, grid, data = views_of_disc("parallel", 8, 64, 24)
+    method: Any = by_name(which)()
+    samples, voxels = method.rays * method.samples_of(64), math.prod(grid.shape)
+
+    def run(steps: int) -> object:
+        return reconstruct(data, geometry, with_settings(method, {"steps": steps}))
+
+    return tuple(SizedRun(steps * samples, voxels, partial(run, steps)) for steps in (1, 4))

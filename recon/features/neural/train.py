@@ -8,21 +8,20 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from recon.base.arrays import F32, Mask
+from recon.base.declared_types import Bound, Checked, Count, NonNegative, Positive
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
-from recon.features.neural.networks import Field
-from recon.features.neural.rays import Places, drawn, rays_of
+from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume
 from recon.splatting.train import used_and_kept_back
 from recon.voxels.direct import direct_work
@@ -40,7 +39,7 @@ _TOP = 0.98  # share of the highest density that counts as reached
 
 
 @dataclass(frozen=True)
-class FieldMethod(ABC):
+class FieldMethod(Checked, ABC):
     """Settings of every neural field.
 
     Attributes:
@@ -61,24 +60,16 @@ class FieldMethod(ABC):
     label: ClassVar[str]
     traits: ClassVar[Traits] = Traits(device=True, held_out=True, any_grid=True, needs_matter=True, halo=4)
 
-    steps: int = 3000
-    seconds: float | None = None
+    steps: Count = 3000
+    seconds: NonNegative | None = None
     early_stop: bool = False
     allow_negative: bool = False
-    rays: int = 1024
-    samples: int | None = None
+    rays: Count = 1024
+    samples: Annotated[int, Bound(2)] | None = None
     foreground: bool = False
-    rate: float = 1e-2
-    highest: float = 2.0
-    width: int = 32
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self,
-            whole={"steps": 1, "rays": 1, "width": 1, "samples": 2},
-            least={"seconds": 0.0},
-            above={"rate": 0.0, "highest": 0.0},
-        )
+    rate: Positive = 1e-2
+    highest: Positive = 2.0
+    width: Count = 32
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return fit_field(self, problem, control)
@@ -311,8 +302,7 @@ class _Fit:
         self.history.append(
             Progress(self.step, self.method.steps, seconds, self.loss, self.residual, 0, n_views, self.held_out)
         )
-        if self.control.on_progress is not None:
-            self.control.on_progress(self.history[-1])
+        self.control.tell(self.history[-1])
 
     @torch.no_grad()
     def volume(self, grid: Grid) -> F32:

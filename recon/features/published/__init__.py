@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recon.base.method_entry import Lengths, MethodEntry
+from recon.base.registry import Lengths, MethodEntry
 
 METHODS = {
     "r2-published": MethodEntry(

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from recon.base.choices import Start
-from recon.base.kernel import Kernel
+from recon.base.kernel import Kernel, Truncation
 from recon.base.method import Traits
-from recon.base.ray_model import Truncation
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 
 _STEPS = 30_000
 

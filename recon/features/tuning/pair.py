@@ -16,7 +16,7 @@ from scipy.ndimage import rotate
 
 from recon.base.arrays import F64
 from recon.prep.align import AxisError, axis_from_pair
-from recon.prep.axis_search import FEWEST_BANDS
+from recon.prep.axis_wedge import FEWEST_BANDS
 
 BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8

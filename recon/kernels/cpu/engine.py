@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, activate, activation_backward
 from recon.kernels.cpu.footprints import HU, INEXACT, RayCamera, footprint_table, footprints, footprints_backward

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu.footprints import INEXACT
 from recon.kernels.gpu.footprints import HU, beam_of, footprints, footprints_backward

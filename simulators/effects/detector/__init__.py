@@ -6,26 +6,26 @@ from functools import partial
 
 from simulators.effects.domain import Domain, EffectRow
 
-_Row = partial(EffectRow, package=__name__)
+_optics, _pixels = (partial(EffectRow, module=f"{__name__}.{name}") for name in ("optics", "pixels"))
 EFFECTS = {
-    "rolling_shutter": _Row(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
-    "afterglow": _Row(Domain.MOTION, "the scintillator still emits light of earlier moments"),
-    "scintillator_blur": _Row(
+    "rolling_shutter": _pixels(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
+    "afterglow": _optics(Domain.MOTION, "the scintillator still emits light of earlier moments"),
+    "scintillator_blur": _optics(
         Domain.PHOTONS,
         "scintillator and optics blur, and glare far away",
         frozenset({"beam_profile", "beam_bend", "narrow_field", "black_band"}),
         "the scintillator blurs all light that reaches it",
     ),
-    "flat_structure": _Row(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
-    "prnu": _Row(
+    "flat_structure": _optics(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
+    "prnu": _pixels(
         Domain.PHOTONS,
         "pixels differ in how much light they detect",
         frozenset({"scatter", "scintillator_blur"}),
         "pixels differ in their response to light that is spread already",
     ),
-    "hot_pixels": _Row(Domain.ELECTRONS, "a few pixels have a large dark current"),
-    "zingers": _Row(Domain.ELECTRONS, "stray X-rays hit the sensor"),
-    "dead_pixels": _Row(
+    "hot_pixels": _pixels(Domain.ELECTRONS, "a few pixels have a large dark current"),
+    "zingers": _pixels(Domain.ELECTRONS, "stray X-rays hit the sensor"),
+    "dead_pixels": _pixels(
         Domain.ELECTRONS,
         "a few pixels do not respond to light",
         frozenset({"dark_current", "hot_pixels", "zingers"}),

@@ -6,11 +6,13 @@ from functools import partial
 
 from simulators.effects.domain import Domain, EffectRow
 
-_Row = partial(EffectRow, package=__name__)
+_deflected, _phase_fringes = (
+    partial(EffectRow, module=f"{__name__}.{name}") for name in ("deflected", "phase_fringes")
+)
 EFFECTS = {
-    "floaters": _Row(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
-    "phase_fringes": _Row(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
-    "scatter": _Row(
+    "floaters": _deflected(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
+    "phase_fringes": _phase_fringes(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
+    "scatter": _deflected(
         Domain.PHOTONS,
         "photons that the sample deflects arrive elsewhere",
         frozenset({"beam_profile", "beam_bend", "narrow_field"}),

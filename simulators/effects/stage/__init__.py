@@ -6,7 +6,7 @@ from functools import partial
 
 from simulators.effects.domain import Domain, EffectRow
 
-_Row = partial(EffectRow, package=__name__)
+_Row = partial(EffectRow, module=f"{__name__}.errors")
 EFFECTS = {
     "encoder_error": _Row(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
     "backlash": _Row(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),

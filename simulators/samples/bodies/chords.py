@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from recon.base.jit import njit
 from simulators.pixels.bands import share_rows
-from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed
-from simulators.samples.bodies.view import View
+from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, View
 
 Reals = NDArray[np.float64]
 Triple = tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""Packing: solids as flat arrays for the kernels."""
+"""Packing: solids as flat arrays for the kernels, the rays of a frame, and the bodies that may shadow each row."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.frame.detector import Detector
+from simulators.frame.pose import Pose
+from simulators.frame.shot import CannotExposeError
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid, Quaternion, Solid
 
 Reals = NDArray[np.float64]
@@ -93,3 +96,104 @@ def rotation(quaternion: Quaternion) -> Reals:
 def _starts(parts: list[Reals]) -> Wholes:
     """Start of each part in their concatenation, and the end of the last."""
     return np.cumsum([0] + [len(part) for part in parts], dtype=np.int64)
+
+
+class View(NamedTuple):
+    """The rays of a frame, for numba.
+
+    Attributes:
+        u, v: float64 [col], [row], mm.
+        pitch: mm.
+        sod: mm, infinite in a parallel beam.
+        axes: float64 [pose, 3, 3] and
+        origin: float64 [pose, 3], see Pose.frames; one pose for the frame, or one a row.
+        upright: parallel beam and the sample's z is the laboratory's v.
+        first: int64 [row + 1]; the bodies first[j] to first[j + 1] of the next may shadow row j.
+        bodies: int64, in their order.
+    """
+
+    u: Reals
+    v: Reals
+    pitch: float
+    sod: float
+    axes: Reals
+    origin: Reals
+    upright: bool
+    first: Wholes
+    bodies: Wholes
+
+
+def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> View:
+    """The rays of a frame.
+
+    Args:
+        names: of the solids, for messages.
+
+    Raises:
+        ValueError: the number of the pose's angles differs from the number of rows.
+        CannotExposeError: a body at or behind the source of a cone.
+    """
+    rows = detector.shape[0]
+    if pose.angle.shape != (rows,):
+        raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one a row")
+    shift, tilt = pose.shift, pose.tilt
+    if all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, shift, tilt)):  # one pose for all rows
+        shift, tilt = None if shift is None else shift[:1], None if tilt is None else tilt[:1]
+        axes, origin = Pose(pose.angle[:1], shift, tilt).frames()
+    else:
+        axes, origin = pose.frames()
+    upright = math.isinf(detector.sod) and (pose.tilt is None or not pose.tilt.any())
+    low, high = _reach(p, axes, origin, 2)
+    ahead = np.ones(p.kind.size, dtype=np.bool_)
+    if math.isfinite(detector.sod):
+        nearest, farthest = _reach(p, axes, origin, 1)
+        ahead = nearest > -detector.sod
+        _check_ahead(p, names, axes, origin, detector.sod, np.flatnonzero(~ahead))
+        large, small = (detector.sod / np.where(ahead, detector.sod + b, np.inf) for b in (nearest, farthest))
+        low, high = np.minimum(low * large, low * small), np.maximum(high * large, high * small)
+    above = np.clip(np.ceil(low / detector.pitch + detector.axis_row - 1e-9), 0, rows)
+    below = np.clip(np.floor(high / detector.pitch + detector.axis_row + 1e-9) + 1, 0, rows)
+    above, below = np.where(ahead, above, 0).astype(np.int64), np.where(ahead, below, rows).astype(np.int64)
+    first, bodies = _by_row(above, below, rows)
+    pitch, sod = float(detector.pitch), float(detector.sod)
+    return View(detector.u(), detector.v(), pitch, sod, axes, origin, bool(upright), first, bodies)
+
+
+def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:
+    """Bounds of each body along the laboratory's k-th axis in all poses, mm.
+
+    They are its box in the first pose, widened by the difference of the poses."""
+    axis, at = axes[:, :, k], np.einsum("ri,ri->r", axes[:, :, k], origin)
+    drift = np.linalg.norm(axis - axis[0], axis=1).max(initial=0.0)
+    far = np.linalg.norm(p.centre, axis=1) + np.linalg.norm(p.extent, axis=1)
+    reach = p.extent @ np.abs(axis[0]) + drift * far + np.abs(at - at[0]).max(initial=0.0)
+    middle = p.centre @ axis[0] - at[0]
+    return middle - reach, middle + reach
+
+
+def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
+    """Raises CannotExposeError if the exact shape of a doubtful body does not lie wholly in front of the source."""
+    for i in doubtful:
+        axis = axes[:, :, 1]
+        if p.kind[i] == CYLINDER:
+            reach = p.size[i, 0] * np.hypot(axis[:, 0], axis[:, 1]) + p.size[i, 1] * np.abs(axis[:, 2])
+        elif p.kind[i] == ELLIPSOID:
+            reach = np.linalg.norm(np.linalg.solve(p.matrix[i].T, axis.T), axis=0)
+        else:
+            corners = p.vertices[p.first_vertex[i] : p.first_vertex[i + 1]]
+            reach = -(axis @ corners.T).min(axis=1)
+        gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
+        if not gap > 1e-9 * sod:
+            raise CannotExposeError(
+                f"solid {i} ({names[i]}) reaches {-gap:.3g} mm behind the source, which is "
+                f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
+                f"No frame was computed"
+            )
+
+
+def _by_row(above: Wholes, below: Wholes, rows: int) -> tuple[Wholes, Wholes]:
+    """The bodies that touch each row, and the start of each row's; the work is linear in the entries."""
+    height = np.maximum(below - above, 0)
+    bodies = np.repeat(np.arange(above.size), height)
+    row = np.arange(bodies.size) - np.repeat(np.cumsum(height) - height, height) + above[bodies]
+    return np.append(0, np.cumsum(np.bincount(row, minlength=rows))), bodies[np.argsort(row, kind="stable")]

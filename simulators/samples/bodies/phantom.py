@@ -15,9 +15,8 @@ from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.chords import depths
-from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack
+from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack, view_of
 from simulators.samples.bodies.solids import Solid, kind_of
-from simulators.samples.bodies.view import view_of
 
 Reals = NDArray[np.float64]
 Triple = tuple[float, float, float]

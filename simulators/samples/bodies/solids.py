@@ -12,16 +12,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from pydantic import Field
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 LEAST, MOST = 1e-9, 1e9  # mm: with far larger lengths, squares and quotients in the kernels overflow
+Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
+Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
+Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]  # um
 DENSEST = 1e12  # 1/mm: with far larger ones, sums over chords overflow
 FLAT = 1e-9  # Share of a body's size: corners closer than this to a plane count as in it
 
@@ -165,3 +170,27 @@ def _check(solid: Solid, **lengths: float | Vector) -> None:
         raise ValueError(f"{name}: centre must lie within {MOST:g} mm, got {solid.centre}")
     if not isinstance(solid, Cylinder) and not 0 < math.hypot(*solid.quaternion) < math.inf:
         raise ValueError(f"{name}: quaternion must be four numbers (w, x, y, z), finite and not all zero")
+
+
+def octahedron(half: Vector) -> tuple[Vector, ...]:
+    """Corners of |x|/a + |y|/b + |z|/c <= 1 with (a, b, c) = half, mm."""
+    return corners(np.vstack([np.eye(3), -np.eye(3)]) * half)
+
+
+def truncated_octahedron(half: Vector, cut: float) -> tuple[Vector, ...]:
+    """Corners of an octahedron with |x|/a, |y|/b, |z|/c <= cut, above 1/2 and below 1; mm."""
+    ends = np.vstack([np.eye(3), -np.eye(3)])
+    ends_cut = np.array([cut * end + side for end in ends for side in (1 - cut) * ends if not (end * side).any()])
+    return corners(np.unique(np.round(ends_cut, 15), axis=0) * half)
+
+
+def plate(width: float, thickness: float) -> tuple[Vector, ...]:
+    """Corners of a hexagon in x and y with corners on the x axis, `width` mm from corner to corner."""
+    turn = np.arange(6) * np.pi / 3
+    hexagon = np.stack([np.cos(turn), np.sin(turn)], axis=1) * (width / 2)
+    return corners(np.array([(*corner, z) for corner in hexagon for z in (-thickness / 2, thickness / 2)]))
+
+
+def corners(points: NDArray[np.float64]) -> tuple[Vector, ...]:
+    """The points [corner, 3], mm, as a `Polyhedron` takes them."""
+    return tuple((x, y, z) for x, y, z in points.tolist())

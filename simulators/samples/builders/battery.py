@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from simulators.samples.bodies.polyhedra import octahedron
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
-from simulators.samples.builders.piece import Millimetres
+from simulators.samples.bodies.solids import (
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Millimetres,
+    Polyhedron,
+    Solid,
+    kind_of,
+    octahedron,
+)
 
 # Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3. At least
 # 5 % of the beam is then transmitted.

@@ -78,11 +78,15 @@ def _grey(where: str, entry: Any) -> tuple[Solid, str]:
         return solid, name or kind_of(solid)
 
 
-def _read(module: str) -> _Builder:
-    """The builder of a phantom that is read from a file: `phantom` of the module."""
+def _read(name: str, module: str) -> _Builder:
+    """The builder of a phantom that is read from a file: `sample_of` of the module, by its settings."""
 
     def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-        phantom: Sample = import_module(module).phantom(where, mapping, read)
+        found = import_module(module)
+        settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
+        if read is None:
+            raise ValueError(f"{settings.file} cannot be read: no reader of such files was given")
+        phantom: Sample = found.sample_of(settings, read)
         return phantom
 
     return sample
@@ -102,5 +106,5 @@ _KINDS: Mapping[str, _Builder] = {
     "battery": _battery,
     "solids": _solids,
     **{name: _built(name, module) for name, module in in_folders("simulators.samples.builders", "PHANTOMS").items()},
-    **{name: _read(module) for name, module in in_folders("simulators.samples", "PHANTOMS").items()},
+    **{name: _read(name, module) for name, module in in_folders("simulators.samples", "PHANTOMS").items()},
 }

@@ -2,5 +2,5 @@
 
 from __future__ import annotations
 
-SOLID_KEYS = dict.fromkeys(("materials", "material", "instead_of"), f"{__name__}.solids")
+SOLID_KEYS = dict.fromkeys(("materials", "material", "instead_of"), f"{__name__}.parts")
 """Keys of a phantom of solids, or of a solid, that a module reads."""

@@ -7,25 +7,25 @@ parts have the same attenuation at every energy.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
+from simulators.frame.mapping import SceneError, choose, located
 from simulators.frame.pose import Pose
 from simulators.light.beam import Beam
 from simulators.pixels.bands import share_rows
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Solid, kind_of
+from simulators.samples.bodies.solids import SOLIDS, Solid, kind_of
+from simulators.samples.materials.materials import Material
+from simulators.samples.materials.palette import Palette, palette_of
 from simulators.samples.materials.spectrum import Attenuation, Spectrum, light
 from simulators.samples.sample import Sample
-
-if TYPE_CHECKING:  # the tables are loaded only if a scene names a material
-    from simulators.samples.materials.materials import Material
 
 Reals = NDArray[np.float64]
 
@@ -140,8 +140,6 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
         Constituent(Phantom.of([part.solid for part in parts if (part.material, part.instead_of) == kind]), *kind)
         for kind in kinds
     )
-    from simulators.samples.materials.palette import Palette
-
     reach = 2 * Phantom.of([part.solid for part in parts]).radius
     matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
     spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)
@@ -186,3 +184,36 @@ def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Rea
 def _through(matter: Reals, attenuation: Reals) -> Reals:
     """Optical depth at one energy; not by BLAS, whose sums depend on where a ray lies in the array."""
     return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, matter, strict=True)))
+
+
+_OWN_KEYS = ("material", "instead_of", "name")
+
+
+def phantom(where: str, entries: Sequence[tuple[str, Any]], materials: Any, beam: Beam) -> Sample:
+    """The sample of a phantom's solids.
+
+    Args:
+        where: path of the phantom, for messages.
+        entries: path and mapping of each solid.
+        materials: the scene's own, see `palette_of`.
+
+    Raises:
+        SceneError: a wrong entry. ValueError: the beam's energies do not suit the materials.
+    """
+    palette = palette_of(f"{where}.materials", materials)
+    return sample_of([_part(at, entry, palette) for at, entry in entries], beam, palette.filters)
+
+
+def _part(where: str, entry: Any, palette: Palette) -> Part:
+    if not isinstance(entry, Mapping):
+        return Part(choose(where, SOLIDS, entry))
+    own = {key: entry[key] for key in _OWN_KEYS if key in entry}
+    rest = {key: value for key, value in entry.items() if key not in _OWN_KEYS}
+    if wrong := {key: value for key, value in own.items() if not isinstance(value, str)}:
+        raise SceneError(f"{where}: {', '.join(wrong)} must be text, got {wrong}")
+    if "material" in own and "attenuation" in rest:
+        raise SceneError(f"{where}: attenuation and material exclude each other; give one of them")
+    with located(where):
+        named = {key: palette(own[key]) for key in ("material", "instead_of") if key in own}
+        solid = choose(where, SOLIDS, rest | ({"attenuation": 1.0} if named else {}))
+        return Part(solid, **named, name=own.get("name"))

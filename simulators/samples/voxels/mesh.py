@@ -7,15 +7,14 @@ The mesh keeps its place: z of the file is the rotation axis. A voxel has the sh
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.jit import njit
-from simulators.frame.mapping import Positive, build
+from simulators.frame.mapping import Positive
 from simulators.samples.sample import ReadVolume
 from simulators.samples.voxels.voxels import Voxels
 
@@ -45,7 +44,7 @@ class MeshSettings:
     name: str = "matter"
 
 
-def mesh_of(settings: MeshSettings, read: ReadVolume) -> Voxels:
+def sample_of(settings: MeshSettings, read: ReadVolume) -> Voxels:
     """The sample of the settings.
 
     Raises:
@@ -137,11 +136,3 @@ def _left(a: Reals, b: Reals, px: float, py: float, anticlockwise: bool) -> bool
     p, q = (b, a) if flipped else (a, b)
     on_left = (q[0] - p[0]) * (py - p[1]) - (q[1] - p[1]) * (px - p[0]) >= 0
     return on_left == (anticlockwise != flipped)
-
-
-def phantom(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Voxels:
-    """The sample of a scene's mapping; `where`: its path, for messages. Raises SceneError and ValueError."""
-    settings = build(MeshSettings, where, mapping)
-    if read is None:
-        raise ValueError(f"{settings.file} cannot be read: no reader of meshes was given")
-    return mesh_of(settings, read)

@@ -13,15 +13,13 @@ phantom:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.frame.detector import Detector
-from simulators.frame.mapping import Positive, build
+from simulators.frame.mapping import Positive
 from simulators.frame.pose import Pose
 from simulators.samples.sample import ReadVolume, Stored
 from simulators.samples.voxels.voxels import Voxels
@@ -74,7 +72,7 @@ class VolumeSettings:
             raise ValueError("a window needs attenuation_max, largest_line_integral or scale")
 
 
-def voxels_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:
+def sample_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:
     """The sample of the settings.
 
     Raises:
@@ -142,11 +140,3 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
             raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
         return settings.largest_line_integral / most
     return 1.0
-
-
-def phantom(where: str, mapping: Mapping[str, Any], read: ReadVolume | None) -> Voxels:
-    """The sample of a scene's mapping; `where`: its path, for messages. Raises SceneError and ValueError."""
-    settings = build(VolumeSettings, where, mapping)
-    if read is None:
-        raise ValueError(f"{settings.file} cannot be read: no reader of volume files was given")
-    return voxels_of(settings, read)

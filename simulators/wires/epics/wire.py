@@ -8,7 +8,6 @@ DMOV is 0 at once. Nothing is shared with the driver but the form of a value. Wi
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -16,10 +15,11 @@ from typing import Self
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.epics.channel import OPENERS, PvValue
-from drivers.stages.epics.settings import EpicsSettings
+from drivers.stages.epics.stage import EpicsSettings
 from simulators.devices.motor import Ended, PulseMotor
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import SCHEME, plugged
+from simulators.wires.wire import BytesWire
 
 CHOICES = {".SPMG": ("Stop", "Pause", "Move", "Go"), ".SET": ("Use", "Set")}
 DONE, AT_HIGH, PROBLEM, AT_LOW, HOMED = 0x2, 0x4, 0x200, 0x2000, 0x4000  # Bits of MSTA
@@ -57,7 +57,7 @@ class EpicsBuild:
         return MotorRecord(clock, line, self)
 
 
-class MotorRecord:
+class MotorRecord(BytesWire):
     """Safe from several threads. It has fields instead of bytes, which it ignores.
 
     Attributes:
@@ -66,8 +66,9 @@ class MotorRecord:
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: EpicsBuild) -> None:
-        self.clock, self.broken = clock, False
-        self._build, self._lock, self._homed = build, threading.RLock(), False
+        super().__init__(clock)
+        self.broken = False
+        self._build, self._homed = build, False
         self._step = 360 / build.counts_per_turn
         self.motor = PulseMotor(clock, lambda: line, counts_per_turn=build.counts_per_turn, switch_at=build.switch_at)
         line.attach_angle(self.motor.angle_at)
@@ -114,14 +115,8 @@ class MotorRecord:
                 labels = CHOICES.get(suffix, ())
                 self.state[suffix] = float(labels.index(str(value))) if value in labels else value
 
-    def receive(self, data: bytes) -> None:
+    def _take(self, data: bytes) -> None:
         """Ignored."""
-
-    def transmit(self) -> bytes:
-        return b""
-
-    def output_is_high(self, number: int) -> bool:
-        return False
 
     def _go(self, place: float) -> None:
         low, high = (float(self.state[limit]) for limit in (".LLM", ".HLM"))

@@ -7,17 +7,14 @@ a move's end happen at the next call. Where a manual is silent the axis is stric
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Callable, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from drivers.base.clock import Clock
-from simulators.devices.motion import TrapezoidMove
+from simulators.devices.motion import MovedAxis, TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.output import Firmware, FirstPulse, PiOutput, WiredOutput
 
-MOVES_REMEMBERED = 4096
 REFERENCE_VELOCITY = 5.0  # degrees/s
 
 
@@ -70,12 +67,14 @@ class PiAxisBuild:
     switch_at: int | None = None
 
 
-class GcsAxis:
+class GcsAxis(MovedAxis):
     """Not safe from several threads. `line` is the cable in the output that has the settings `wired`."""
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PiAxisBuild, wired: PiOutput) -> None:
         self.build = build
         self.per_degree = build.counts_per_turn / 360.0
+        reference = round(build.found_at * self.per_degree)
+        super().__init__(clock.now(), reference, build.counts_per_turn)
         self.error = 0
         self.referenced = build.referenced
         self.velocity = min(10.0, build.max_velocity)
@@ -84,19 +83,13 @@ class GcsAxis:
         self._clock = clock
         firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
         self._wired = WiredOutput(wired, line, firmware, self.per_degree)
-        reference = round(build.found_at * self.per_degree)
         self._zero = 0 if build.referenced else reference
         self._target = 0.0
-        self._moves = deque([TrapezoidMove(clock.now(), reference, reference, ())], maxlen=MOVES_REMEMBERED)
         self._at_end: Callable[[], None] | None = None
         self._referencing = False
         self._hit = 0
 
     # what it tells
-
-    @property
-    def move(self) -> TrapezoidMove:
-        return self._moves[-1]
 
     def moving(self) -> bool:
         self.catch_up()
@@ -127,11 +120,6 @@ class GcsAxis:
         here = self._counts(self._clock.now()) / self.per_degree
         return here <= self.build.low or self._hit < 0, here >= 0, here >= self.build.high or self._hit > 0
 
-    def angle_at(self, time: float) -> float:
-        """True angle in radians at any time since the oldest move remembered."""
-        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
-        return move.position(time) * 2 * math.pi / self.build.counts_per_turn
-
     # what it does
 
     def switch_servo(self, on: bool) -> None:
@@ -152,12 +140,8 @@ class GcsAxis:
         for place, act in ((self.build.stall_at, self._stalled), (self.build.switch_at, self._ran_into_switch)):
             way = self.move.direction * ((place or 0) - self.move.start)
             if place is not None and 0 < way < abs(self.move.target - self.move.start):
-                self._replace(self.move.halted(place))
+                self._end(self.move.halted(place))
                 self._at_end = act
-
-    def disturb(self, beyond: Callable[[float], float]) -> None:
-        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place, and no status tells."""
-        self._moves[-1] = replace(self.move, beyond=beyond)
 
     def reference(self, kind: str) -> None:
         """Start the reference move of a command FRF, FNL or FPL."""
@@ -201,19 +185,18 @@ class GcsAxis:
 
     def _counts(self, time: float) -> int:
         """True encoder counts: the last edge passed on the way."""
-        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
-        return move.counts(time)
+        return self._at(time)[0].counts(time)
 
     def _begin(self, counts: int, velocity: float) -> None:
         now, scale = self._clock.now(), self.per_degree
         rates = (velocity * scale, self.acceleration * scale, now, self.deceleration * scale)
         move = TrapezoidMove.between(self._counts(now), counts, *rates)
         self._hit = 0
-        self._moves.append(move)
+        self._remember(move)
         self._wired.begin(move, self._zero, move.begin)
 
-    def _replace(self, move: TrapezoidMove) -> None:
-        self._moves[-1] = move
+    def _end(self, move: TrapezoidMove) -> None:
+        self._replace(move)
         self._wired.cut(move, self._clock.now())
 
     def _stand_at(self, counts: int) -> None:
@@ -222,7 +205,7 @@ class GcsAxis:
     def _cut(self, move: TrapezoidMove) -> None:
         """Give the move another end."""
         self._referencing, self._at_end = False, None
-        self._replace(move)
+        self._end(move)
         self._target = (move.target - self._zero) / self.per_degree
 
     def _stalled(self) -> None:

@@ -8,8 +8,6 @@ answered, either. In a reply of several lines all but the last end with SPACE LF
 from __future__ import annotations
 
 import math
-import threading
-from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from typing import Self
@@ -20,6 +18,7 @@ from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
 from simulators.wires.pi_gcs.output import FirstPulse, PiOutput
+from simulators.wires.wire import BytesWire
 
 OUTPUTS = 4
 LONGEST_LINE = 256
@@ -76,43 +75,30 @@ class PiGcsBuild:
         return PiGcsController(clock, line, self)
 
 
-class PiGcsController:
-    """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
+class PiGcsController(BytesWire):
+    """The controller behind the wire.
 
     Args:
         line: the cable in the build's output; it also learns the sample's true angle.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PiGcsBuild) -> None:
-        self.clock = clock
+        super().__init__(clock, build.latency)
         self.replies = 0
         outputs = {number: PiOutput(axis=build.axis) for number in range(1, OUTPUTS + 1)}
         self.box = PiGcsBox(build.axis, GcsAxis(clock, line, build.specimen, outputs[build.output]), outputs)
-        self._latency, self._unknown, self._spoil = build.latency, build.unknown, build.spoil
-        self._in = bytearray()
-        self._out: deque[tuple[float, bytes]] = deque()
-        self._lock = threading.RLock()
-        line.attach_angle(self._angle_at)
+        self._unknown, self._spoil = build.unknown, build.spoil
+        self._turns(line, self.box.axis.angle_at)
 
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host, in pieces of any size."""
-        with self._lock:
-            for byte in data:
-                if byte == 0x0A:
-                    line, self._in = bytes(self._in), bytearray()
-                    self._do_line(line)
-                elif byte in SINGLE:
-                    self._answer(SINGLE[byte](self.box))
-                elif byte != 0x0D and len(self._in) <= LONGEST_LINE:
-                    self._in.append(byte)
-
-    def transmit(self) -> bytes:
-        """Bytes for the host that are due and not yet taken."""
-        with self._lock:
-            taken = bytearray()
-            while self._out and self._out[0][0] <= self.clock.now():
-                taken += self._out.popleft()[1]
-            return bytes(taken)
+    def _take(self, data: bytes) -> None:
+        for byte in data:
+            if byte == 0x0A:
+                line, self._in = bytes(self._in), bytearray()
+                self._do_line(line)
+            elif byte in SINGLE:
+                self._answer(SINGLE[byte](self.box))
+            elif byte != 0x0D and len(self._in) <= LONGEST_LINE:
+                self._in.append(byte)
 
     def output_is_high(self, number: int) -> bool:
         return self.box.levels.get(number, False)
@@ -137,10 +123,4 @@ class PiGcsController:
         if reply is None:
             return
         number, self.replies = self.replies, self.replies + 1
-        data = self._spoil(number, (" \n".join(reply) + "\n").encode("cp1252"))
-        if data:
-            self._out.append((self.clock.now() + self._latency, data))
-
-    def _angle_at(self, time: float) -> float:
-        with self._lock:
-            return self.box.axis.angle_at(time)
+        self._send(self._spoil(number, (" \n".join(reply) + "\n").encode("cp1252")))

@@ -7,7 +7,6 @@ that the box refuses, only sets an error flag (ERRF?, ERR?).
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from typing import Self, TypeVar
@@ -16,6 +15,7 @@ from drivers.base.clock import Clock
 from drivers.stages.pm16c.settings import Pm16cFirstPulse, PM16CSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.box import WIDTHS, BoxBuild, PM16CBox, Pm16cError, Refused
+from simulators.wires.wire import BytesWire
 
 END = b"\r\n"
 LONGEST_LINE = 256
@@ -118,44 +118,25 @@ class PM16CBuild:
         return PM16CController(clock, line, self)
 
 
-class PM16CController:
-    """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
+class PM16CController(BytesWire):
+    """No output of it can be set.
 
     Args:
         line: the cable in the TP0 connector (position controller A); it also learns the sample's true angle.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PM16CBuild) -> None:
-        self.clock = clock
+        super().__init__(clock)
         self.queries = 0
         self.box = PM16CBox(clock, line, build.box)
         self._silent, self._garbled = build.silent, build.garbled
-        self._in, self._out = bytearray(), bytearray()
-        self._lock = threading.RLock()
-        line.attach_angle(self._angle_at)
+        self._turns(line, self.box.sample.angle_at)
 
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host, in pieces of any size."""
-        with self._lock:
-            self._in += data
-            while END in self._in:
-                line, _, rest = bytes(self._in).partition(END)
-                self._in = bytearray(rest)
-                self._do(line)
-            if len(self._in) > LONGEST_LINE:
-                self._in.clear()
-                self.box.errors |= Pm16cError.COMMAND
-
-    def transmit(self) -> bytes:
-        """Bytes for the host that are not yet taken."""
-        with self._lock:
-            out = bytes(self._out)
-            self._out.clear()
-            return out
-
-    def output_is_high(self, number: int) -> bool:
-        """False: no output of this controller can be set."""
-        return False
+    def _take(self, data: bytes) -> None:
+        self._take_lines(data, END, self._do)
+        if len(self._in) > LONGEST_LINE:
+            self._in.clear()
+            self.box.errors |= Pm16cError.COMMAND
 
     def _do(self, line: bytes) -> None:
         text = line.decode("ascii", errors="replace")
@@ -172,13 +153,9 @@ class PM16CController:
     def _reply(self, text: str) -> None:
         at, self.queries = self.queries, self.queries + 1
         if at in self._garbled:
-            self._out += b"\xfe\x00" + text[::-1].encode("ascii") + END
+            self._send(b"\xfe\x00" + text[::-1].encode("ascii") + END)
         elif at not in self._silent:
-            self._out += text.encode("ascii") + END
-
-    def _angle_at(self, time: float) -> float:
-        with self._lock:
-            return self.box.sample.angle_at(time)
+            self._send(text.encode("ascii") + END)
 
 
 def _find(table: tuple[tuple[str, Callable[..., T]], ...], text: str) -> Callable[[PM16CBox], T] | None:

@@ -6,17 +6,14 @@ microsteps/s² times 1.6384 / 10 000. A real axis re-plans a move under way; thi
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
-from simulators.devices.motion import TrapezoidMove
+from simulators.devices.motion import MovedAxis, TrapezoidMove
 
 SPEED_UNIT = 1.6384
 ACCELERATION_UNIT = 1.6384e-4
-MOVES_REMEMBERED = 4096
 PRIORITY = "FF FN FZ FH FV FO FC FM FD FQ FI FA FR FS FB FP FE FT WL WV WT WS WM WP WR WH NC NI ND NR NT NU NJ NB"
 """Warning flags, the gravest first."""
 
@@ -49,13 +46,14 @@ class ZaberAxisBuild:
     switch_at: int | None = None
 
 
-class SimulatedZaberAxis:
+class SimulatedZaberAxis(MovedAxis):
     """One axis. Times are s on the device's clock, positions whole microsteps.
 
     `stall_at` and `switch_at` may be changed while it stands, as if a person clears the way.
     """
 
     def __init__(self, now: float, build: ZaberAxisBuild) -> None:
+        super().__init__(now, 0.0, build.counts_per_turn)
         self.settings: dict[str, int] = {
             "maxspeed": round(build.counts_per_turn / 36 * SPEED_UNIT),
             "motion.accelonly": 100,
@@ -66,25 +64,13 @@ class SimulatedZaberAxis:
         self.homed, self.enabled = build.homed, True
         self.flags: set[str] = set()
         self.stall_at, self.switch_at = build.stall_at, build.switch_at
-        self._angle_of_count = 2 * math.pi / build.counts_per_turn
-        self._moves = deque([TrapezoidMove(now, 0.0, 0.0, ())], maxlen=MOVES_REMEMBERED)
         self._at_end: Callable[[], None] | None = None
-
-    @property
-    def move(self) -> TrapezoidMove:
-        """The move under way, or the last one."""
-        return self._moves[-1]
 
     def moving(self, now: float) -> bool:
         return now < self.move.end
 
     def position(self, now: float) -> int:
         return self.move.counts(now)
-
-    def angle_at(self, time: float) -> float:
-        """True angle in radians at any time since the oldest move remembered."""
-        move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
-        return move.position(time) * self._angle_of_count
 
     def settle(self, now: float) -> bool:
         """Set the flags of a move that has ended; returns whether one has ended since the last call."""
@@ -100,8 +86,8 @@ class SimulatedZaberAxis:
         return sorted(standing, key=PRIORITY.index)
 
     def disturb(self, beyond: Callable[[float], float], *flags: str) -> None:
-        """Until its next move, `beyond` (counts at a time in s) turns it beyond its place; only these flags tell."""
-        self._moves[-1] = replace(self.move, beyond=beyond)
+        """As that of any axis; only these flags tell."""
+        super().disturb(beyond)
         self.flags.update(flags)
 
     def start(self, now: float, target: int) -> None:
@@ -126,13 +112,13 @@ class SimulatedZaberAxis:
             return
         slowed = self.move.slowed(now, self.settings["motion.decelonly"] / ACCELERATION_UNIT)
         if self.move.direction * (self.move.target - slowed.target) > 0:  # otherwise the move ends earlier by itself
-            self._moves[-1] = slowed
+            self._replace(slowed)
         self._interrupt()
 
     def halt(self, now: float) -> None:
         """Stand at once, at the last whole microstep."""
         if self.moving(now):
-            self._moves[-1] = self.move.halted(self.position(now))
+            self._replace(self.move.halted(self.position(now)))
             self._interrupt()
 
     def _ready(self, now: float) -> None:
@@ -147,7 +133,7 @@ class SimulatedZaberAxis:
         return TrapezoidMove.between(self.position(now), target, speed, acceleration, begin=now)
 
     def _begin(self, move: TrapezoidMove, ending: Callable[[], None]) -> None:
-        self._moves.append(move)
+        self._remember(move)
         self._at_end = ending
 
     def _nothing(self) -> None:

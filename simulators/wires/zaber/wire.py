@@ -8,7 +8,6 @@ memory: a wrong checksum gets no answer. Other modules of this folder say what e
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -17,6 +16,7 @@ from typing import Self
 from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.wire import BytesWire
 from simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
 from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
 from simulators.wires.zaber.triggers import OUTPUTS
@@ -148,41 +148,34 @@ class ZaberBuild:
         return ZaberController(clock, line, self)
 
 
-class ZaberController:
-    """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
+class ZaberController(BytesWire):
+    """The device behind the wire.
 
     Args:
         line: the cable in the build's digital output; it also learns the sample's true angle.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: ZaberBuild) -> None:
-        self.clock = clock
+        super().__init__(clock)
         self.replies = 0
         self.device = ZaberDevice(clock, line, build.device)
         self._address, self._echo, self._faults = build.address, build.echo, build.faults
         self._reader = PacketReader()
-        self._out = bytearray()
-        self._lock = threading.RLock()
-        line.attach_angle(self._angle_at)
+        self._turns(line, self.device.axis.angle_at)
 
-    def receive(self, data: bytes) -> None:
-        """Bytes from the host, in pieces of any size."""
-        with self._lock:
-            if self._echo:
-                self._out += data
-            for packet in self._reader.feed(data):
-                self._settle()
-                command = packet.command if isinstance(packet, Malformed) else packet
-                if command.address in (0, self._address):
-                    self._answer(command, packet.reason if isinstance(packet, Malformed) else "")
+    def _take(self, data: bytes) -> None:
+        if self._echo:
+            self._send(data)
+        for packet in self._reader.feed(data):
+            self._settle()
+            command = packet.command if isinstance(packet, Malformed) else packet
+            if command.address in (0, self._address):
+                self._answer(command, packet.reason if isinstance(packet, Malformed) else "")
 
     def transmit(self) -> bytes:
-        """Bytes for the host that are not yet taken."""
         with self._lock:
             self._settle()
-            out = bytes(self._out)
-            self._out.clear()
-            return out
+            return super().transmit()
 
     def output_is_high(self, number: int) -> bool:
         outputs = self.device.triggers.outputs
@@ -190,7 +183,7 @@ class ZaberController:
 
     def alert(self) -> None:
         """Send an alert without a command."""
-        self._out += frame(f"!{self._address:02d} 1 {self._state()}", self.device.checksums)
+        self._send(frame(f"!{self._address:02d} 1 {self._state()}", self.device.checksums))
 
     def _settle(self) -> None:
         if self.device.settle() and self.device.alerts:
@@ -216,18 +209,14 @@ class ZaberController:
         # A position read just before the end of a move must not go with IDLE.
         state = before if command.words[:1] == ("get",) else self._state()
         reply = frame(f"@{where} {flag} {state} {data}", self.device.checksums)
-        self._out += _spoilt(reply, fault)
+        self._send(_spoilt(reply, fault))
         for text in information:
-            self._out += frame(f"#{where} {text}", self.device.checksums)
+            self._send(frame(f"#{where} {text}", self.device.checksums))
 
     def _state(self) -> str:
         """BUSY or IDLE, and the gravest warning flag."""
         busy = self.device.axis.moving(self.clock.now())
         return f"{'BUSY' if busy else 'IDLE'} {next(iter(self.device.axis.warnings()), '--')}"
-
-    def _angle_at(self, time: float) -> float:
-        with self._lock:
-            return self.device.axis.angle_at(time)
 
 
 def _spoilt(reply: bytes, fault: Fault | None) -> bytes:

@@ -15,7 +15,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.reconstruct import budget, checkpoints, job, pipeline
 from beamline.storage.writers.recon_file import read_reconstruction
-from recon.assess.plans import Speeds
+from recon.assess.time_model import Speeds
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.splatting import optimise as fit
 from recon.splatting import train

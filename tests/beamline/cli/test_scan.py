@@ -19,7 +19,7 @@ from beamline.config.load import config_folder
 from beamline.scan import run as run_module
 from beamline.storage.readers.open import open_scan
 from drivers.base.errors import DeviceError
-from drivers.manual import Ask, ManualShutter
+from drivers.in_beam import Ask, ManualShutter
 from tests.beamline.fakes import FakeInstrument, Faults
 
 SIMULATED = str(config_folder() / "simulated.yaml")

@@ -13,7 +13,7 @@ import pytest
 
 from beamline.cli.terminal import Terminal, fit, rates
 from beamline.core.events import FitReached, FrameStored, Warned, event_of
-from beamline.core.narration import UserLog, sentence
+from beamline.core.sinks import UserLog, sentence
 
 FRAME: dict[str, Any] = {
     "n": 90,

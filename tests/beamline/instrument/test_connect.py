@@ -19,7 +19,7 @@ from beamline.instrument import connect as devices
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import TriggerSource
 from drivers.frame_memory import FrameMemory
-from drivers.manual import ManualSampleMover, ManualShutter
+from drivers.in_beam import ManualSampleMover, ManualShutter
 from drivers.orca_quest import DcamOptions
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from beamline.instrument.operator import ask_operator
+from beamline.instrument.connect import ask_operator
 from drivers.base.errors import DeviceError
 
 

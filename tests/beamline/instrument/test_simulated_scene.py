@@ -23,7 +23,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
-from recon.voxels.fdk import fdk
+from recon.voxels.direct import fdk
 from tests.beamline.ball_scan import BALL, shipped, with_scene
 from tests.beamline.simulate.read_labels import read_labels
 

@@ -23,7 +23,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
-from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
+from recon.assess.time_model import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
@@ -31,8 +31,7 @@ from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -72,7 +71,7 @@ def test_the_time_is_used_and_not_exceeded(
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
+    monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
     done = _spend(prepared, budget, SteppedClock(100.0, 0.01))
     assert done.settings["chosen_method"] == "r2"
     assert 0.9 * budget < done.seconds <= budget
@@ -135,7 +134,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
 ) -> None:
     """More steps than were best on other scans follow the noise."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))
+    monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_: FinishPlan(0, 0.0))
     monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, SteppedClock(100.0, 0.1), methods=(R2(),))
     assert done.history[-1].step == 7 and done.seconds < 30

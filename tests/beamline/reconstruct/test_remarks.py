@@ -15,8 +15,8 @@ from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
+from recon.voxels.matter_checks import stray_mass
 from recon.voxels.projector import project
-from recon.voxels.stray_mass import stray_mass
 from tests.beamline.prepared_views import prepared_views
 
 FIRST_FRAME, FIRST_ROW = 20, 30

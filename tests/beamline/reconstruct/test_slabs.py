@@ -15,7 +15,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import OsSirtTv
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
 

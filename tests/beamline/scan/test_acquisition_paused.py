@@ -19,7 +19,7 @@ from beamline.scan.states import State, StateMachine
 from beamline.scan.supervision import BacklogGuard, Supervision, Workload
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame
-from drivers.manual import ManualShutter
+from drivers.in_beam import ManualShutter
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults
 

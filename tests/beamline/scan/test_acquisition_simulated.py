@@ -53,8 +53,8 @@ class FaultyInstrument:
             self.line,
             self.clock,
             0,
-            self.shutter,
-            self.sample,
+            self.shutter.is_open,
+            self.sample.is_in,
             OrcaQuestBuild(lost=lost, ignored=ignored),
         )
 

@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
-from simulators.effects.anomaly import Label
+from simulators.effects.chain import Label
 from tests.beamline.simulate.read_labels import read_labels
 
 A, B, C = (0, 4, 0, 4), (1, 5, 1, 5), (2, 6, 2, 6)

@@ -163,24 +163,6 @@ def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(came
         camera.next_frame(1.0)
 
 
-def test_framestamps_start_at_zero_at_every_arm(camera: DcamCamera, world) -> None:
-    for _ in range(2):
-        camera.arm(2)
-        world.pulses(2)
-        assert take(camera, 2) == [0, 1]
-        camera.disarm()
-
-
-def test_pulses_that_come_too_early_give_no_frame(camera: DcamCamera, world) -> None:
-    camera.arm(3)
-    period, start = camera.timing.min_period, world.clock.now()
-    times = start + period * np.array([1.0, 1.5, 2.1, 3.1])
-    world.schedule(times)
-    assert [camera.next_frame(1.0).time for _ in range(3)] == pytest.approx(times[[0, 2, 3]], abs=3e-6)
-    with pytest.raises(DeviceTimeout):
-        camera.next_frame(0.01)
-
-
 def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world) -> None:
     world.fault("start_polls", 3)
     camera.arm(1)
@@ -245,39 +227,6 @@ def test_a_camera_that_cannot_signal_its_stop(world) -> None:
     camera.close()
 
 
-def test_no_trigger_is_a_timeout_that_leaves_it_armed(camera: DcamCamera, world) -> None:
-    camera.arm(2)
-    with pytest.raises(DeviceTimeout, match=r"within 0.01 s.*\(external\).*still armed"):
-        camera.next_frame(0.01)
-    world.pulse()
-    assert take(camera, 1) == [0]
-
-
-def test_software_triggers(camera: DcamCamera, world) -> None:
-    camera.configure(replace(EXTERNAL, trigger=TriggerSource.SOFTWARE))
-    camera.arm(2)
-    for index in range(2):
-        camera.software_trigger()
-        np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(index))
-    assert not world.pulse()
-
-
-def test_software_trigger_is_refused_where_it_cannot_work(camera: DcamCamera) -> None:
-    with pytest.raises(DeviceRefused, match="not armed"):
-        camera.software_trigger()
-    camera.arm(1)
-    with pytest.raises(DeviceRefused, match="trigger external"):
-        camera.software_trigger()
-
-
-def test_free_run(camera: DcamCamera, world) -> None:
-    camera.configure(replace(EXTERNAL, trigger=TriggerSource.INTERNAL))
-    camera.arm(4)
-    frames = [camera.next_frame(1.0) for _ in range(4)]
-    assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
-    assert np.diff([frame.time for frame in frames]) == pytest.approx(camera.timing.min_period, abs=2e-6)
-
-
 def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera, world) -> None:
     camera.arm(3)
     world.pulses(2)
@@ -306,27 +255,6 @@ def test_unplugged_in_a_scan(camera: DcamCamera, world) -> None:
     camera.disarm()  # no second report that the camera is gone
     camera.close()
     camera.close()
-
-
-def test_states_that_do_not_fit(camera: DcamCamera) -> None:
-    with pytest.raises(DeviceError, match="not armed"):
-        camera.next_frame(0.01)
-    with pytest.raises(DeviceRefused, match="less than one frame"):
-        camera.arm(0)
-    camera.arm(1)
-    with pytest.raises(DeviceRefused, match="armed already"):
-        camera.arm(1)
-    with pytest.raises(DeviceRefused, match="disarm"):
-        camera.configure(EXTERNAL)
-
-
-def test_disarm_is_legal_in_every_state(camera: DcamCamera) -> None:
-    camera.disarm()
-    camera.arm(1)
-    camera.disarm()
-    camera.disarm()
-    camera.close()
-    camera.disarm()
 
 
 def test_close_ends_everything_and_may_be_repeated(world) -> None:

@@ -17,7 +17,7 @@ from beamline.scan import recorder
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
-from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
 from drivers.orca_quest import DcamOptions, TriggerPolarity
@@ -74,15 +74,6 @@ def test_each_pulse_of_a_turning_stage_is_a_frame_at_its_time(world, polarity: T
             expected = (COUNTS // 10 + 100 * frame.framestamp) * COUNT + late
             assert angle == pytest.approx(expected, abs=0.1 * COUNT)
             np.testing.assert_array_equal(frame.counts, world.pattern(frame.framestamp, (0, 0, *SENSOR)))
-
-
-def test_a_stage_that_turns_too_fast_loses_every_other_pulse_without_a_word(world) -> None:
-    with FlyRig(world) as rig:
-        rig.camera.configure(EXTERNAL)
-        period = rig.camera.timing.min_period
-        frames = fly(rig, interval=15, n=40, speed=15 / (0.6 * period))
-        assert [frame.framestamp for frame in frames] == list(range(20))
-        assert np.diff([frame.time for frame in frames]) == pytest.approx(1.2 * period, abs=5e-6)
 
 
 def test_pulses_that_a_stopped_stage_takes_back_never_come(world) -> None:
@@ -202,34 +193,3 @@ def test_a_scan_names_what_the_camera_lost(
         assert trigger not in missing
         assert angle == pytest.approx(trigger * COUNTS / 360, abs=1e-6)
         assert bits == trigger % 16  # each row has the angle of its own pixels
-
-
-def test_a_scan_names_pulses_that_never_reached_the_camera(world, tmp_path: Path) -> None:
-    with FlyRig(world, lost_pulses={11, 40, 41}) as rig:
-        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
-    assert isinstance(scanned.error, LedgerError)
-    assert [row - DARKS - FLATS for row in scanned.error.missing] == [11, 40, 41]
-
-
-def test_a_camera_that_is_unplugged_in_a_scan_ends_it_with_its_name(world, tmp_path: Path) -> None:
-    with FlyRig(world) as rig:
-        world.fault("unplug_at", 20)
-        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
-        assert isinstance(scanned.error, DeviceError)
-        assert "NOCONNECTION" in str(scanned.error)
-        assert not rig.stage.moving()
-    taken = [trigger for trigger, _, _ in scanned.views()]
-    assert taken == list(range(len(taken)))
-    assert 15 <= len(taken) <= 20
-    world.fault("unplug_at", 0)
-    world.fault("unplugged", 0)
-    again = world.connect()  # in the same process
-    assert again.describe()["model"] == "C15550-20UP"
-    again.close()
-
-
-def test_a_stage_that_stalls_leaves_the_frames_before_it(world, tmp_path: Path) -> None:
-    with FlyRig(world, stall_at=COUNTS // 12) as rig:
-        scanned = Scanned(rig, small(60, "scan.period_s=0.1", "scan.angles.span_deg=60"), tmp_path)
-    assert scanned.error is not None
-    assert [trigger for trigger, _, _ in scanned.views()] == list(range(31))

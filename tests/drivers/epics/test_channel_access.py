@@ -14,8 +14,7 @@ from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, open_channel
 from drivers.epics.devices import FilterPvs, PvFilter, PvShutter, PvSource, ShutterPvs
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from tests.drivers.soft_ioc import PREFIX
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
@@ -65,7 +64,7 @@ def test_a_shutter_by_labels(ioc: ProcessVariable) -> None:
 
 def test_a_filter_by_labels(ioc: ProcessVariable) -> None:
     url = f"{URL}blade"
-    changer = PvFilter(FilterPvs(url, url, {"none": "Open", "Al 1 mm": "Closed"}, timeout=30.0), SystemClock())
+    changer = PvFilter(FilterPvs(pv=url, places={"none": "Open", "Al 1 mm": "Closed"}, timeout=30.0), SystemClock())
     for place, label in (("Al 1 mm", "Closed"), ("none", "Open")):
         changer.put(place)
         assert changer.place() == place and ioc.read("blade")[0].label == label

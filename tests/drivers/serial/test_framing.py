@@ -239,27 +239,3 @@ def test_a_transcript_that_cannot_be_written_is_refused_before_anything_is_sent(
     with pytest.raises(DeviceError, match=r"transcript.*Nothing was sent"):
         connect(wire, transcript=tmp_path / "no such folder" / "line.txt")
     assert wire.heard == []
-
-
-def test_a_port_that_does_not_open_leaves_no_transcript_open(tmp_path: Path) -> None:
-    path = tmp_path / "line.txt"
-    with pytest.raises(DeviceError, match="does not open"):
-        SerialLine(
-            "sim://nobody",
-            LineRules(Probe("", "")),
-            VirtualClock(),
-            device="d",
-            timeout=1.0,
-            baudrate=1,
-            transcript=path,
-        )
-    assert path.read_text() == ""
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only some systems have a disk that is always full")
-def test_a_disk_that_is_full_ends_the_transcript_and_not_the_conversation() -> None:
-    line = connect(Script(b"1\n", b"x\n"), transcript=Path("/dev/full"))
-    assert line.query("A?", r"\d", "a digit")[0] == "1"
-    with pytest.raises(DeviceError, match="have the form"):
-        line.query("B?", r"\d", "a digit")
-    line.close()

@@ -6,7 +6,7 @@ import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from drivers.serial.ports import SerialPort, serial_ports
+from drivers.serial.line import SerialPort, serial_ports
 
 
 def listed(device: str, **facts: object) -> ListPortInfo:

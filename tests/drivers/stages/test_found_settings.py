@@ -11,9 +11,8 @@ import pytest
 
 from beamline.config.stages import FoundOnDisk, file_of
 from drivers.base.protocols import RotationStage
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
-from drivers.stages.kept import RestoresSettings
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
+from drivers.stages.shared import RestoresSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import register
 from tests.drivers.soft_ioc import TickingClock, record_of

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from recon.assess.plans import CURVES, PRESETS, Choice, QualityCurve, Speeds, best_steps, plans
+from recon.assess.time_model import CURVES, PRESETS, Choice, QualityCurve, Speeds, best_steps, plans
 from recon.methods import build, by_name
 
 SPEEDS = st.builds(

@@ -10,8 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from recon.assess.metrics import psnr
-from recon.assess.plans import CURVES
-from recon.assess.time_model import duration_text, next_decibel, next_decibel_of_fit, parse_budget
+from recon.assess.time_model import CURVES, duration_text, next_decibel, next_decibel_of_fit, parse_budget
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.base.binning import bin_views
+from recon.base.arrays import bin_views
 from recon.base.geometry import Geometry
 
 

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 import recon
-from recon.base.picture import fan, middle_slices, png
+from recon.base.greys import fan, middle_slices, png
 
 
 def _seen(page: str) -> np.ndarray:

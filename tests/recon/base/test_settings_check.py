@@ -5,32 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
 
+from recon.base.declared_types import Bound, Checked, Count, Natural, NonNegative, Positive
 from recon.base.kernel import Kernel
-from recon.base.settings_check import check_settings
 from recon.base.volume import Grid
 
 
 @dataclass(frozen=True)
-class Some:
-    steps: int | None = None
-    level: int = 3
-    weight: float = 0.0
-    rate: float | None = None
+class Some(Checked):
+    steps: Natural | None = None
+    level: Annotated[int, Bound(1, 16)] = 3
+    weight: NonNegative = 0.0
+    rate: Positive | None = None
     start: Literal["fbp", "tv"] = "fbp"
     shape: Kernel = Kernel.COMPACT
     size: tuple[int, int] | None = None
     names: Sequence[str] = ()
-    part: Grid | int = 1
-
-    def __post_init__(self) -> None:
-        check_settings(
-            self, whole={"steps": 0, "level": (1, 16), "part": 1}, least={"weight": 0.0}, above={"rate": 0.0}
-        )
+    part: Grid | Count = 1
 
 
 @pytest.mark.parametrize(

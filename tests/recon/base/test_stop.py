@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from recon.base.decisions import Stop
 from recon.base.method import RunControl
-from recon.base.stop import Stop
 
 
 def test_who_has_asked_is_not_asked_again() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.base.vectors import geometry_of_vectors, vectors_of
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians

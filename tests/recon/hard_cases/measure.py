@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize

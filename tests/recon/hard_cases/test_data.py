@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.kernel import Truncation
 from recon.base.method import DataUse
-from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.prep.correct import References, correct
 from recon.reconstruction import Reconstruction, reconstruct

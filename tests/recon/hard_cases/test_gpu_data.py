@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import Truncation
+from recon.base.kernel import Truncation
 from recon.base.volume import Grid
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm
 from recon.kernels.reference import projection_loss

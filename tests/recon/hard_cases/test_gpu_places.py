@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize

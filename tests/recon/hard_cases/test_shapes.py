@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.prep.air import air_columns, edge_profiles
 from recon.prep.correct import Correction, CorrectionSettings, Projections, References, correct, merge_and_empty
-from recon.prep.defects import dead_pixels
+from recon.prep.references import air_columns, dead_pixels, edge_profiles
 
 PLAIN = CorrectionSettings(hot_threshold=np.inf, zinger_threshold=np.inf, air="none")
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from recon.prep.defects import shadowed
+from recon.prep.references import shadowed
 
 N, ROWS, COLS, NOISE = 16, 24, 60, 1e-3
 ALL = slice(None)

@@ -11,7 +11,7 @@ from numba import get_num_threads, set_num_threads
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.splatting.backend import Cpu, backend_for
 from recon.splatting.gaussians import Gaussians

@@ -12,8 +12,7 @@ from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
-from recon.splatting.density_control import DensityPolicy
-from recon.splatting.settings import FitSettings, growth
+from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.splat import project
 from tests.recon.conftest import Make
 

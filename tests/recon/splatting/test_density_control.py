@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from recon.base.volume import Grid
 from recon.kernels.reference import covariances, rotation_matrices
-from recon.splatting.density_control import Change, DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import Change, DensityPolicy, control
 from tests.recon.conftest import Make
 
 FIELD = 20.0

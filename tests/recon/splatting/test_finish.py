@@ -25,8 +25,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.pnp_dct import PnpDct
+from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]

@@ -77,7 +77,7 @@ def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
     """Seconds do not suffice for the same finish in every slab; another one would show as a seam."""
     decided = Decisions().made
     for found in (3, 0):
-        monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
+        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=(decide := Decisions(followed=decided)))
         done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
         assert done.settings["finish"] == 3
@@ -88,7 +88,7 @@ def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
     parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for trials in (True, False):
-        monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, t=trials: FinishPlan(2, 0.2, t))
+        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, t=trials: FinishPlan(2, 0.2, t))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=Decisions(), stop_trials=lambda: True)
         done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
         assert done.settings["finish"] == 2 and control.decide is not None

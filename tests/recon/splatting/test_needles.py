@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.splatting.gaussians import Gaussians
-from recon.splatting.needles import needles
+from recon.splatting.gaussians import Gaussians, needles
 
 VIEWS = Geometry.parallel([0.0, 1.0], (8, 8), pixel_pitch=0.2)  # half a pixel is 0.1 mm
 

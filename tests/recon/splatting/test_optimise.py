@@ -9,14 +9,13 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import Truncation
+from recon.base.kernel import Truncation
 from recon.base.volume import Grid
 from recon.kernels.reference import projection_loss
 from recon.kernels.reference import total_variation as reference_tv
 from recon.splatting import optimise as fit
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import NAMES, FitSettings, growth
+from recon.splatting.settings import NAMES, DensityPolicy, FitSettings, growth
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double, run_steps

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import Truncation
+from recon.base.kernel import Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Cpu

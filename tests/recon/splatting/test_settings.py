@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import Truncation
+from recon.base.kernel import Kernel, Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.problem import join_pixels

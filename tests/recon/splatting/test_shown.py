@@ -11,9 +11,9 @@ from recon import Geometry, Grid
 from recon.assess.metrics import psnr
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.splatting import optimise
-from recon.splatting.last_round import LastRound
+from recon.splatting.anytime import PredictionErrors, direct_volume, volume_error
+from recon.splatting.in_time import LastRound
 from recon.splatting.r2 import R2
-from recon.splatting.shown import PredictionErrors, direct_volume, volume_error
 from recon.splatting.stream import StreamingFit
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector

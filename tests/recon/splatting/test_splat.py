@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view

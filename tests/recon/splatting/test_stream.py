@@ -15,10 +15,9 @@ from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting import stream
 from recon.splatting.anytime import WHILE_VIEWS_COME
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, joined_for
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
 from simulators.frame.detector import Detector

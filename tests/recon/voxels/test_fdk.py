@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu import joseph
-from recon.voxels import fdk as fdk_module
+from recon.voxels import direct as direct_module
+from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk
 
 
 def ball_views(geometry: Geometry, radius: float, centre: tuple[float, float, float]) -> NDArray[np.float32]:
@@ -99,7 +99,7 @@ def test_a_detector_beside_the_axis_sees_twice_its_half(axis_col: float) -> None
 def test_progress_counts_layers_up_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
     views = Geometry.cone(np.linspace(0, 2 * np.pi, 12, endpoint=False), (8, 20), 0.05, 40.0, 60.0)
     monkeypatch.setattr(joseph, "CALL", 1)
-    monkeypatch.setattr(fdk_module, "SLAB_BYTES", 4 * 8 * 20 * 5)  # five views at a time
+    monkeypatch.setattr(direct_module, "SLAB_BYTES", 4 * 8 * 20 * 5)  # five views at a time
     told: list[tuple[int, int]] = []
     fdk(np.ones((12, 8, 20), np.float32), views, on_block=lambda n, of: told.append((n, of)))
     assert told == sorted(told) and len(told) > 20 and told[-1] == (20, 20)

@@ -63,7 +63,7 @@ def test_a_texture_survives(
     found = recon.reconstruct(data, geometry, method, grid=grid).volume.data
     monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, method, grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.noise_balance.noise_beside_structure", lambda lines, _: noise_level(lines))
+    monkeypatch.setattr("recon.voxels.priors.noise_beside_structure", lambda lines, _: noise_level(lines))
     by_texture = recon.reconstruct(data, geometry, method, grid=grid).volume.data  # the texture counts as noise
     assert psnr(truth, found, peak) > psnr(truth, by_texture, peak) + 2
     assert psnr(truth, by_noise, peak) > psnr(truth, by_texture, peak) + 1

@@ -18,15 +18,11 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Method
 from recon.base.volume import Grid, Volume
-from recon.features.iterative.asd_pocs import AsdPocs
-from recon.features.iterative.cgls import Cgls
-from recon.features.iterative.sart import Sart
-from recon.features.iterative.sirt import Sirt
+from recon.features.iterative.methods import AsdPocs, Cgls, Sart, Sirt
 from recon.reconstruction import reconstruct
 from recon.voxels.fbp import fbp
 from recon.voxels.iterative import IterativeMethod, Watch, solve
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
+from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, largest_eigenvalue
 from tests.recon.kernels.voxels_reference import system_matrix

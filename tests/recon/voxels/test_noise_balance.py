@@ -13,9 +13,8 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.iterative import solve
-from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.methods.os_sirt_tv import OsSirtTv
-from recon.voxels.noise_balance import NoiseBalance
+from recon.voxels.methods import FistaTv, OsSirtTv
+from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]

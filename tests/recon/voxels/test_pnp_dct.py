@@ -13,9 +13,8 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import RunControl
-from recon.base.slabs import part_of, slabs_of
-from recon.base.volume import Grid
-from recon.voxels.pnp_dct import pnp_dct, towards_views
+from recon.base.volume import Grid, part_of, slabs_of
+from recon.voxels.priors import pnp_dct, towards_views
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 

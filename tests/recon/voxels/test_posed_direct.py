@@ -9,9 +9,8 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.voxels.direct import direct, has_direct_method, posed_direct
+from recon.voxels.direct import direct, fdk, has_direct_method, posed_direct
 from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
 _AXES, _CENTRE = np.array([0.5, 0.35, 0.4]), np.array([0.12, -0.2, 0.1])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_kernels
@@ -23,11 +23,12 @@ from recon.kernels.cpu import joseph
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project as gaussian_views
 from recon.splatting.splat import voxelize
-from recon.voxels.fdk import fdk
-from recon.voxels.projector import Projector, data_residual, project
+from recon.voxels.direct import fdk
+from recon.voxels.projector import Projector, project
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Ellipsoid
+from tests.recon.helpers import data_residual
 from tests.recon.kernels.voxels_reference import system_matrix
 
 
@@ -423,8 +424,6 @@ def test_misfits_are_named() -> None:
         Projector(geometry, volume.grid).forward(np.zeros((3, 2, 2), np.float32))
     with pytest.raises(ValueError, match="shape"):
         data_residual(volume, np.ones((2, 3, 48), np.float32), geometry)
-    with pytest.raises(ValueError, match="all zero"):
-        data_residual(volume, np.zeros((1, 3, 48), np.float32), geometry)
 
 
 def test_it_reads_as_a_matrix() -> None:

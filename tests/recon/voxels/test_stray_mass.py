@@ -9,7 +9,7 @@ import pytest
 
 import recon
 from recon.base.geometry import Geometry
-from recon.voxels.stray_mass import LIMIT, seen_empty, stray_mass
+from recon.voxels.matter_checks import STRAY_LIMIT, seen_empty, stray_mass
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
@@ -75,7 +75,7 @@ def test_few_views_leave_less_in_the_air_of_a_fit_than_of_fbp(count: int, rng: n
         found = stray_mass(recon.reconstruct(data, geometry, method, grid=GRID).volume, data, geometry)
         assert found is not None
         shares.append(found.share)
-    assert shares[0] > LIMIT > 0.02 > shares[1]
+    assert shares[0] > STRAY_LIMIT > 0.02 > shares[1]
 
 
 @pytest.mark.parametrize("axis", [0.0, 5.0])

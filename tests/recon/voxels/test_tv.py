@@ -7,7 +7,7 @@ import pytest
 
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import total_variation as total_variation_cpu
-from recon.voxels.tv import TotalVariationProx, difference_weights
+from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 from tests.recon.voxels.tv_reference import total_variation, transposed_differences
 
 CUBES = (1.0, 1.0, 1.0)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, unexplained
 from recon.voxels.projector import Projector
-from recon.voxels.unexplained import LIMIT, unexplained
 
 F32 = NDArray[np.float32]
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 60, endpoint=False), (8, 64))
@@ -29,16 +29,19 @@ def _views(rng: np.random.Generator, sigma: float = 0.03) -> F32:
 
 def test_a_filled_crack_is_seen_where_it_is(rng: np.random.Generator) -> None:
     found = unexplained(Volume(TOOTH, GRID), _views(rng), VIEWS, rng)
-    assert found is not None and found.share > 2 * LIMIT
+    assert found is not None and found.share > 2 * UNEXPLAINED_LIMIT
     strong = found.significance < -4  # the volume has too much there
-    assert strong[CRACK].mean() > 0.5 and strong[np.hypot(X - 6.5, np.maximum(abs(Y) - 12, 0)) > 6].mean() < LIMIT
+    assert (
+        strong[CRACK].mean() > 0.5
+        and strong[np.hypot(X - 6.5, np.maximum(abs(Y) - 12, 0)) > 6].mean() < UNEXPLAINED_LIMIT
+    )
 
 
 @pytest.mark.parametrize("rings", [0.0, 0.1])
 def test_the_truth_leaves_noise_and_rings(rng: np.random.Generator, rings: float) -> None:
     offsets = np.where(rng.random((8, 64)) < 0.05, rings, 0).astype(np.float32)
     found = unexplained(Volume(TRUTH, GRID), _views(rng) + offsets, VIEWS, rng)
-    assert found is not None and found.share < LIMIT / 3
+    assert found is not None and found.share < UNEXPLAINED_LIMIT / 3
 
 
 @pytest.mark.parametrize("turns", [2, 1])
@@ -57,7 +60,7 @@ def test_a_filled_crack_is_seen_by_views_that_step_up_and_down(rng: np.random.Ge
     closed = unexplained(Volume(np.repeat(filled[None], len(truth), axis=0), grid), views, moved, rng)
     true = unexplained(Volume(truth, grid), views, moved, rng)
     assert closed is not None and true is not None
-    assert closed.share > 2 * LIMIT > LIMIT > true.share
+    assert closed.share > 2 * UNEXPLAINED_LIMIT > UNEXPLAINED_LIMIT > true.share
 
 
 def test_it_is_in_units_of_the_noise(rng: np.random.Generator) -> None:

@@ -12,13 +12,13 @@ import recon
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
-from recon.base.slabs import bands_of
-from recon.base.volume import Grid
+from recon.base.volume import Grid, bands_of
 from recon.kernels.cpu.spread import spread
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize
 from recon.voxels.fbp import fbp
-from recon.voxels.projector import Projector, data_residual, views_of_exposure
+from recon.voxels.projector import Projector, views_of_exposure
+from tests.recon.helpers import data_residual
 from tests.recon.voxels.balls import ball_views
 
 ANGLES = np.arange(9) * 0.37

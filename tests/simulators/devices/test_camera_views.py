@@ -19,7 +19,7 @@ def test_a_beam_lost_in_view_two_is_lost_in_the_third_projection_whatever_was_ta
     """And in the flat that is taken just before it: a flat counts to the view that is exposed next."""
     clock, shutter, sample = VirtualClock(), SimulatedShutter(), SimulatedSampleMover()
     scene = shots.scene({"kind": "lost_beam", "views": [2, 3]}, phantom={"kind": "solids", "solids": []})
-    camera = SimulatedOrcaQuest(scene, TriggerLine(clock), clock, 5, shutter, sample)
+    camera = SimulatedOrcaQuest(scene, TriggerLine(clock), clock, 5, shutter.is_open, sample.is_in)
     camera.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
     light = ""
     for kind in "dfpfpdfppf":  # dark, flat, projection

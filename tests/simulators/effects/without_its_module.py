@@ -1,9 +1,10 @@
-"""Without its module: looks whether each effect is imported where no scene names it, and whether the others still make
-the same frames where it cannot be imported. Run as a program, for it unloads the simulators again and again:
+"""Without its module: looks whether each module of effects is imported where no scene names one of them, and whether
+the other effects still make the same frames where it cannot be imported. Run as a program, for it unloads the
+simulators again and again:
 
     python -m tests.simulators.effects.without_its_module
 
-It prints, as JSON, what went wrong by effect, and the effects that were taken away.
+It prints, as JSON, what went wrong by module, and the modules that were taken away.
 """
 
 from __future__ import annotations
@@ -16,23 +17,19 @@ import traceback
 from simulators.effects.catalogue import CATALOGUE
 from tests.simulators.effects import on_demand
 
-NAMES = list(CATALOGUE)
-
-
-def _module(name: str) -> str:
-    return f"{CATALOGUE[name].package}.{name}"
+MODULES = sorted({row.module for row in CATALOGUE.values()})
 
 
 def _imported() -> list[str]:
-    return [name for name in NAMES if _module(name) in sys.modules]
+    return [module for module in MODULES if module in sys.modules]
 
 
-def _imports(name: str) -> list[str]:
-    """The effects that its module imports where nothing of the simulators has been imported yet."""
+def _imports(module: str) -> list[str]:
+    """The modules of effects that it imports where nothing of the simulators has been imported yet."""
     kept = {key: module for key, module in sys.modules.items() if key.split(".")[0] == "simulators"}
     for key in kept:
         del sys.modules[key]
-    importlib.import_module(_module(name))
+    importlib.import_module(module)
     found = _imported()
     for key in [key for key in sys.modules if key.split(".")[0] == "simulators"]:
         del sys.modules[key]
@@ -40,10 +37,10 @@ def _imports(name: str) -> list[str]:
     return found
 
 
-def _without(name: str) -> str:
-    """What goes wrong with the frames of all others where its module cannot be imported; empty if nothing does."""
-    scene = on_demand.scene([other for other in NAMES if other != name])
-    with_it, key = on_demand.frames(scene), _module(name)
+def _without(key: str) -> str:
+    """What goes wrong with the frames of all others where it cannot be imported; empty if nothing does."""
+    scene = on_demand.scene([other for other, row in CATALOGUE.items() if row.module != key])
+    with_it = on_demand.frames(scene)
     module = sys.modules.pop(key)
     sys.modules[key] = None  # type: ignore[assignment]  # to Python: there is none
     try:
@@ -59,14 +56,14 @@ def main() -> None:
     on_demand.frames(on_demand.scene([]))
     if found := _imported():
         wrong["a scene without effects"] = f"imported {found}"
-    for name in NAMES:
-        if (found := _imports(name)) != [name]:
-            wrong[name] = f"imported {found}"
-    on_demand.frames(on_demand.scene(NAMES))
-    for name in NAMES:
-        if said := _without(name):
-            wrong[name] = said
-    sys.stdout.write(json.dumps({"wrong": wrong, "taken": NAMES}))
+    for module in MODULES:
+        if (found := _imports(module)) != [module]:
+            wrong[module] = f"imported {found}"
+    on_demand.frames(on_demand.scene(list(CATALOGUE)))
+    for module in MODULES:
+        if said := _without(module):
+            wrong[module] = said
+    sys.stdout.write(json.dumps({"wrong": wrong, "taken": MODULES}))
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def test_scenes_that_come_with_the_package_load(name: str) -> None:
 def test_every_effect_of_the_catalogue_matches_its_entry(name: str) -> None:
     effect = load_effect(name)
     assert (effect.name, effect.domain) == (name, CATALOGUE[name].domain)
-    assert effect.__module__ == f"{CATALOGUE[name].package}.{name}"
+    assert effect.__module__ == CATALOGUE[name].module
 
 
 def _with(**changes: Any) -> dict[str, Any]:

@@ -1,7 +1,100 @@
-"""Configuration of beam monitors: an electrometer, a page with the ring current, an EPICS process variable."""
+"""The section of each kind of beam monitor, and how its driver is connected."""
 
 from __future__ import annotations
 
-from beamline.config.families.beam_monitors.sections import ElectrometerConfig, EpicsBeamConfig, RingCurrentConfig
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, PositiveInt
+
+from beamline.config.beam import BeamMonitorSection
+from beamline.config.section import without
+from drivers.base.clock import Clock
+from drivers.beam_monitors.reading import (
+    PATTERN,
+    QUERY,
+    ElectrometerQuery,
+    PageSource,
+    SerialSource,
+    TextBeamMonitor,
+    pattern_problem,
+    url_problem,
+)
+from drivers.epics.channel import url_problem as pv_problem
+from drivers.epics.devices import PvSource
+
+Pattern = Annotated[str, without(pattern_problem)]
+PvUrl = Annotated[str, without(pv_problem)]
+
+
+class ElectrometerConfig(BeamMonitorSection):
+    """An electrometer or picoammeter on a serial port that answers a query with a line that holds a number."""
+
+    kind: Literal["electrometer"]
+    port: Annotated[str, Field(min_length=1)]
+    """A serial port, socket://host:port, or sim://electrometer."""
+    query: Annotated[str, Field(min_length=1)] = QUERY
+    pattern: Pattern = PATTERN
+    """Regular expression whose first group is the number."""
+    unit: str = "A"
+    setup: tuple[str, ...] = ()
+    """Commands without a reply, sent once at the start."""
+    line_end: Literal["crlf", "cr", "lf"] = "crlf"
+    baudrate: PositiveInt = 9600
+    transcript: str | None = None
+    """As the stage's."""
+
+    @property
+    def counterpart(self) -> str:
+        return self.kind
+
+    @property
+    def simulated(self) -> bool:
+        return self.port.lower().startswith("sim://")
+
+    @property
+    def end(self) -> bytes:
+        """Of lines, both ways."""
+        return {"crlf": b"\r\n", "cr": b"\r", "lf": b"\n"}[self.line_end]
+
+    def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:
+        source = SerialSource(
+            url or self.port,
+            clock,
+            ElectrometerQuery(self.query, self.pattern, self.setup, self.end),
+            timeout=self.timeout_s,
+            baudrate=self.baudrate,
+            transcript=None if self.transcript is None else Path(self.transcript),
+        )
+        return TextBeamMonitor(source, clock, pattern=self.pattern, unit=self.unit, scale=self.scale)
+
+
+class RingCurrentConfig(BeamMonitorSection):
+    """The ring current from a page or a text file."""
+
+    kind: Literal["ring_current"]
+    url: Annotated[str, without(url_problem)]
+    """http://..., https://... or file:///..."""
+    pattern: Pattern
+    """Regular expression whose first group is the number."""
+    unit: str = "mA"
+
+    def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:
+        source = PageSource(url or self.url, clock, timeout=self.timeout_s)
+        return TextBeamMonitor(source, clock, pattern=self.pattern, unit=self.unit, scale=self.scale)
+
+
+class EpicsBeamConfig(BeamMonitorSection):
+    """The ring current, or an intensity, from an EPICS process variable."""
+
+    kind: Literal["epics"]
+    pv: PvUrl
+    """pva://NAME or ca://NAME."""
+    unit: str = "mA"
+
+    def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:
+        source = PvSource(url or self.pv, self.timeout_s)
+        return TextBeamMonitor(source, clock, pattern="(.*)", unit=self.unit, scale=self.scale)
+
 
 BEAM_MONITORS = {"electrometer": ElectrometerConfig, "ring_current": RingCurrentConfig, "epics": EpicsBeamConfig}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.projections.step import StepDone, StepMemory, option
-from recon.base.binning import bin_views
+from recon.base.arrays import bin_views
 from recon.base.volume import Grid, Volume
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
             the beam is a cone, whose views need not hold the same mass.
     """
     from recon.features.beam_hardening.curve import NoCurveError, curve_of_paths
-    from recon.post.clusters import k_means
+    from recon.post.enhance import k_means
     from recon.reconstruction import reconstruct
     from recon.voxels.projector import project
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
-    from recon.features.calibration.freedom import GeometryChange
+    from recon.features.calibration.joint import GeometryChange
     from recon.features.calibration.learn import LearntGeometry
 
     Progress = Callable[[int, int], None]

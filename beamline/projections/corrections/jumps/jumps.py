@@ -175,7 +175,7 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
     from beamline.projections.correction import at_once_memory
     from beamline.projections.usable_views import usable_views
     from recon.voxels.displacement import SWEEPS
-    from recon.voxels.methods.os_sirt_tv import OsSirtTv
+    from recon.voxels.methods import OsSirtTv
 
     asked = selection.step(Preparation)
     jumps = usable_views(source, asked.uses_flags).jumps

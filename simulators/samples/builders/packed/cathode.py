@@ -12,10 +12,21 @@ import numpy as np
 from pydantic import Field
 
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, Share
-from simulators.samples.bodies.polyhedra import corners, octahedron, plate, truncated_octahedron
-from simulators.samples.bodies.solids import Cylinder, Ellipsoid, Polyhedron, Quaternion, Vector
+from simulators.samples.bodies.solids import (
+    Cylinder,
+    Ellipsoid,
+    Gap,
+    Micrometres,
+    Polyhedron,
+    Quaternion,
+    Vector,
+    corners,
+    octahedron,
+    plate,
+    truncated_octahedron,
+)
 from simulators.samples.builders.packed.arrangement import arrange, bodies_of
-from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
+from simulators.samples.builders.packed.pieces import Piece, PieceBuilder, check_roles
 
 Grain = Ellipsoid | Polyhedron
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.base.jit import njit
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
-from simulators.samples.builders.piece import Gap, Micrometres, Millimetres, Piece, PieceBuilder, check_roles
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Gap, Micrometres, Millimetres
+from simulators.samples.builders.packed.pieces import Piece, PieceBuilder, check_roles
 
 Reals = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Vector
-from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Gap, Micrometres, Polyhedron, Vector
+from simulators.samples.builders.packed.pieces import Piece, PieceBuilder, check_roles
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar": "Al", "star": "Al", "ball": "Al"})
 GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})

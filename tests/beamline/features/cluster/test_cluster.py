@@ -22,7 +22,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.features.iterative.sirt import Sirt
+from recon.features.iterative.methods import Sirt
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 

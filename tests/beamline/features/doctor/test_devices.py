@@ -16,7 +16,7 @@ from beamline.features.doctor import devices
 from beamline.features.doctor.check import Grade
 from beamline.features.doctor.devices import port, ports
 from drivers.dcam import session as preflights
-from drivers.serial.ports import SerialPort
+from drivers.serial.line import SerialPort
 from tests.drivers.dcam.fake import World, build
 from tests.drivers.dcam.usb_bus import Bus, Descriptor
 

@@ -18,8 +18,8 @@ from beamline.scenes.truth import Truth, binning_of, truth_of, write_truth
 from beamline.storage.readers.open import open_scan
 from drivers.base.clock import SystemClock
 from recon.base.volume import Grid
+from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk
 from simulators.frame.detector import Detector
 from tests.beamline.storage.file_layout import names, paths, unmatched
 

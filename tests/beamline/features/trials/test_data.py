@@ -10,7 +10,7 @@ import numpy as np
 from beamline.features.trials.launch import TrialData, write_reference, write_regions
 from recon.base.geometry import Geometry
 from recon.base.method import Energies
-from recon.prep.emission import Emission
+from recon.prep.counts import Emission
 from tests.beamline.prepared_views import prepared_views
 
 

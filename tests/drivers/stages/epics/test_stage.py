@@ -10,8 +10,7 @@ from uuid import uuid4
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.stages.epics.settings import EpicsSettings
-from drivers.stages.epics.stage import EpicsStage
+from drivers.stages.epics.stage import EpicsSettings, EpicsStage
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import MotorRecord
 from simulators.wires.serial_url import register

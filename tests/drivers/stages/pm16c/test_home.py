@@ -84,7 +84,7 @@ def test_the_speed_of_a_search_is_the_configured_one_or_a_tenth_of_the_fastest(r
     "settings", [{"home_speed": 100.0}, {"home_speed": 0.0}, {"home": math.nan}, {"home": -math.inf}]
 )
 def test_settings_of_a_search_that_cannot_be_are_refused(rig: Rig, settings: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"search for home|home switch"):
+    with pytest.raises(ValueError, match=r"search for home|home switch|home(_speed)? is (0.0|nan|-inf)"):
         rig.open(**settings)
     rig.open().close()
 
@@ -161,27 +161,6 @@ def test_a_move_after_a_search_that_failed_is_a_move(rig: Rig) -> None:
 
 
 # what gets lost
-
-
-@pytest.mark.parametrize("lost", ["TMGC", "SPDH", "FDHP"])
-def test_a_command_lost_on_the_way_is_noticed_before_the_search_counts_as_begun(rig: Rig, lost: str) -> None:
-    stage = rig.open()
-    stage.arm(TriggerTrain(1000, 100, 5))
-    rig.lose(lost)
-    with pytest.raises(DeviceError, match=lost):
-        stage.start_home()
-    assert not stage.moving()
-    assert stage.position() == 0.0
-
-
-@pytest.mark.parametrize("lost", ["GTHP", "PSB"])
-def test_a_later_step_lost_on_the_way_is_noticed(rig: Rig, lost: str) -> None:
-    stage = rig.open()
-    stage.start_home()
-    rig.lose(lost)
-    with pytest.raises(DeviceError, match=lost):
-        stage.wait(LONG)
-    assert not stage.moving()
 
 
 def test_a_silent_line_during_the_search_says_that_the_stage_may_be_turning() -> None:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.settings import StageFigures, Wiring
-from drivers.stages.zaber.settings import ZaberSettings
-from drivers.stages.zaber.train import PulseSettings, TriggerUse, remaining, set_up
+from drivers.stages.zaber.settings import PulseSettings, TriggerUse, ZaberSettings, remaining, set_up
 from drivers.testing.stages.bench import LONG, SPEED, StageBench
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_rig import Rig
@@ -89,7 +88,6 @@ def test_a_controller_with_fewer_triggers_is_noticed() -> None:
         {"width": 0.0015},
         {"width": math.nan},
         {"starter": 2},
-        {"output": 0},
         {"chained": False, "fires_when_enabled": True},
     ],
 )

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.features.beam_hardening.curve import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
-from simulators.effects.beam.beam_hardening import BeamHardening
+from simulators.effects.beam.energies import BeamHardening
 from tests.simulators import shots
 
 ENERGIES = st.lists(st.tuples(st.floats(0.1, 1.0), st.floats(10.0, 100.0)), min_size=1, max_size=4)

@@ -13,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.features.calibration.background import LearntBackground, learn_background
 from recon.voxels.iterative import solve
-from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.features.calibration.freedom import GeometryChange, knowable
+from recon.features.calibration.joint import GeometryChange, knowable
 from recon.features.calibration.learn import LearntGeometry, better, learn_geometry
 from tests.recon.features.calibration.bodies import balls
 

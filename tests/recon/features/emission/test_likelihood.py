@@ -12,8 +12,8 @@ import recon
 from recon.base.geometry import Geometry
 from recon.base.method import Method
 from recon.base.volume import Grid, Volume
-from recon.features.emission.likelihood import attenuation_factors, mlem, passes_by_halves
-from recon.prep.emission import Emission, weighted_lines
+from recon.features.emission.methods import attenuation_factors, mlem, passes_by_halves
+from recon.prep.counts import Emission, weighted_lines
 from recon.voxels.projector import Projector
 
 F32 = np.float32

@@ -7,7 +7,7 @@ import pytest
 
 from recon.base.arrays import F32
 from recon.base.volume import Grid
-from recon.features.joint.share_fit import STEPS, fit_share
+from recon.features.joint.proportions import STEPS, fit_share
 from recon.features.joint.spectral import Materials, fit_materials
 from tests.recon.features.joint.test_spectral import EDGE, rms, views_of
 

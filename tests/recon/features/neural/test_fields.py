@@ -16,7 +16,8 @@ from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.features.neural.networks import LineAttention
 from recon.features.neural.train import FieldMethod
-from recon.voxels.projector import Projector, data_residual
+from recon.voxels.projector import Projector
+from tests.recon.helpers import data_residual
 
 ANGLES = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 VIEWS = {

@@ -7,7 +7,7 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.features.neural.rays import drawn, rays_of
+from recon.features.neural.networks import drawn, rays_of
 from recon.voxels.projector import Projector
 
 GRID = Grid((20, 32, 32), 0.25, (0.4, 0.2, -0.3))

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from skimage.measure import regionprops
 
 from recon.features.particles.particles import bodies_outside, cleaned, measured, parted, volume_deviation
-from recon.post.clusters import clusters
-from recon.post.enhance import enhanced, inscribed_box
+from recon.post.enhance import clusters, enhanced, inscribed_box
 from tests.recon.post.phantom import BALLS, CIRCLE, SHAPE, can, inside
 
 

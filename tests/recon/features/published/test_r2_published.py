@@ -12,10 +12,9 @@ from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
 from recon.features.published.r2_published import R2Published, published_fit
 from recon.kernels.reference import rotation_matrices
-from recon.splatting.density_control import Change, DensityPolicy, control
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import density_unit, neighbour_distance, sample_as_published
-from recon.splatting.settings import in_steps
+from recon.splatting.settings import Change, DensityPolicy, control, in_steps
 from recon.voxels.projector import Projector
 from tests.recon.conftest import Make
 

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel
+from recon.base.kernel import Kernel, RayModel
 from recon.kernels import reference
 from recon.splatting.autograd import On, Project, Voxelize
 from recon.splatting.gaussians import Gaussians

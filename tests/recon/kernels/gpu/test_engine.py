@@ -9,15 +9,13 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, Cpu, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
-from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.settings import NAMES, FitSettings
+from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double, run_steps

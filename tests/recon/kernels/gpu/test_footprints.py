@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
-from recon.base.ray_model import RayModel
+from recon.base.kernel import RayModel
 from recon.base.volume import Grid
 from recon.kernels import reference
 from recon.kernels.cpu import footprints as footprints_cpu

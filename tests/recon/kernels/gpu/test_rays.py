@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.base.ray_model import RayModel, Truncation
+from recon.base.kernel import RayModel, Truncation
 from recon.kernels import reference
 from recon.splatting.splat import project
 from tests.recon.conftest import Make

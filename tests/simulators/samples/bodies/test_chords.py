@@ -14,8 +14,8 @@ from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.chords import columns
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.polyhedra import octahedron as octahedron_
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron
+from simulators.samples.bodies.solids import octahedron as octahedron_
 from tests.simulators.bodies import SOLIDS, chords, rays
 
 SODS = [math.inf, 1.2, 300.0]

@@ -11,8 +11,18 @@ from scipy.spatial import ConvexHull
 
 from simulators.frame.mapping import SceneError, choose
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, POLYHEDRON, pack
-from simulators.samples.bodies.polyhedra import octahedron, plate, truncated_octahedron
-from simulators.samples.bodies.solids import SOLIDS, Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
+from simulators.samples.bodies.solids import (
+    SOLIDS,
+    Box,
+    Cylinder,
+    Ellipsoid,
+    Polyhedron,
+    Solid,
+    kind_of,
+    octahedron,
+    plate,
+    truncated_octahedron,
+)
 from tests.simulators import bodies
 
 CUBE = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]

@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
-from simulators.samples.bodies.packing import pack
+from simulators.samples.bodies.packing import pack, view_of
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.polyhedra import octahedron
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
-from simulators.samples.bodies.view import view_of
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid, octahedron
 from tests.simulators.bodies import SOLIDS, TURNABLE, chords, rays, turned
 
 

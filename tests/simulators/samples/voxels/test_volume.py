@@ -11,7 +11,7 @@ from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
-from simulators.samples.voxels.volume import Stored, VolumeSettings, voxels_of
+from simulators.samples.voxels.volume import Stored, VolumeSettings, sample_of
 from simulators.samples.voxels.voxels import Voxels
 from simulators.scenes.scene import load_scene
 
@@ -22,7 +22,7 @@ def _voxels(values: np.ndarray = VALUES, spacing: Any = None, **settings: Any) -
     def read(file: str, dataset: str | None) -> Stored:
         return Stored(values if file == "v" else values.clip(0, 3), spacing)
 
-    return voxels_of(VolumeSettings("v", **({"voxel_mm": 0.1} | settings)), read)
+    return sample_of(VolumeSettings("v", **({"voxel_mm": 0.1} | settings)), read)
 
 
 def _values(voxels: Voxels) -> np.ndarray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 import recon
 from beamline.projections.corrections.beam_hardening.hardening import Hardening, curve_of
 from recon.base.geometry import Geometry
-from simulators.effects.beam.beam_hardening import BeamHardening
+from simulators.effects.beam.energies import BeamHardening
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder

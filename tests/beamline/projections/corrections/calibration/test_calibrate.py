@@ -24,7 +24,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.geometry import Geometry
-from recon.features.calibration.freedom import knowable
+from recon.features.calibration.joint import knowable
 from tests.recon.features.calibration.bodies import balls
 
 N, SHAPE, PITCH, AXIS = 48, (24, 48), 0.5, 23.9

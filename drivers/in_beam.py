@@ -1,0 +1,280 @@
+"""Devices that move in the beam by others: a stage with named places, a shutter on an output, and manual devices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import DigitalOutput, RotationStage
+
+POLL = 0.05  # s between looks at a motor that moves
+MARGIN = 10.0  # s beyond twice the time of a move after which it has failed
+INSIDE, OUTSIDE = "into the beam", "out of the beam"
+
+
+@dataclass(frozen=True)
+class StagePlaces:
+    """Positions of a stage by name.
+
+    Attributes:
+        places: rad of the stage.
+        speed: rad/s.
+        failed: how an error begins; the name of the place ends its sentence.
+    """
+
+    places: Mapping[str, float]
+    speed: float
+    failed: str = "the filter did not come to"
+
+
+class PlacedStage:
+    """A stage that goes to named places. Implements `drivers.base.protocols.Filter` and `Watchable`.
+
+    Each call asks the stage where it is, since a person may have moved it, and moves unless it stands there.
+    """
+
+    def __init__(self, stage: RotationStage, places: StagePlaces, clock: Clock, name: str = "filter") -> None:
+        self.name = name
+        self._stage, self._places, self._clock = stage, places, clock
+        self._check: Callable[[], None] = lambda: None
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again on the way; its exception stops the stage and ends the move."""
+        self._check = check
+
+    def place(self) -> str | None:
+        """Raises DeviceError."""
+        return next((name for name in self._places.places if self._is_at(name)), None)
+
+    def put(self, place: str) -> None:
+        """Raises DeviceError: it did not arrive."""
+        stage, speed, target = self._stage, self._places.speed, self._places.places[place]
+        try:
+            if self._is_at(place):
+                return
+            way = abs(stage.position() - target)
+            stage.start_move(target, speed)
+            deadline = self._clock.now() + 2 * (way / speed + speed / stage.limits.acceleration) + MARGIN
+            try:
+                while stage.moving() and self._clock.now() < deadline:
+                    self._check()
+                    self._clock.sleep(POLL)
+            except BaseException:
+                stage.abort()
+                raise
+            stage.wait(POLL)
+        except DeviceError as cause:
+            advice = cause.advice or "Look where it is before the next scan"
+            problem = f"{self._places.failed} {place}: {cause.device}: {cause.problem}"
+            raise cause.told_by(self.name, problem, advice=advice) from cause
+
+    def remember_place(self) -> Callable[[], str]:
+        """See `drivers.base.protocols.Rechecked`."""
+        before = self._stage.position()
+
+        def moved() -> str:
+            if self._stands_at(before):
+                return ""
+            now, place = self._stage.position(), self.place()
+            named = f" ({place})" if place else ""
+            return f"it stood at {math.degrees(before):.4f} deg, and is at {math.degrees(now):.4f} deg{named}"
+
+        return moved
+
+    def close(self) -> None:
+        """Close the connection; the stage stays where it is."""
+        self._stage.close()
+
+    def _is_at(self, place: str) -> bool:
+        return self._stands_at(self._places.places[place])
+
+    def _stands_at(self, angle: float) -> bool:
+        """Within the tolerance that the stage's own moves arrive with."""
+        stage = self._stage
+        away = stage.to_counts(stage.position()) - stage.to_counts(angle)
+        return abs(away) <= stage.limits.tolerance and not stage.moving()
+
+
+class StageSampleMover:
+    """Implements `drivers.base.protocols.SampleMover` by a stage with the places INSIDE and OUTSIDE."""
+
+    def __init__(self, motor: PlacedStage) -> None:
+        self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
+        self.remember_place = motor.remember_place
+
+    def out(self) -> None:
+        """Raises DeviceError: the sample did not arrive."""
+        self._motor.put(OUTSIDE)
+
+    def back(self) -> None:
+        """Raises DeviceError: the sample did not arrive."""
+        self._motor.put(INSIDE)
+
+
+NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+
+
+class OutputShutter:
+    """Implements `drivers.base.protocols.Shutter` on a controller's output.
+
+    Reading back checks the output, not the blade: only the beam shows whether the shutter moved. `close` always sends
+    its command, even if the shutter is known to be closed.
+
+    Args:
+        output: the line that drives the shutter.
+        open_high: a high line opens the shutter. With False a low line does, and so does a controller without power.
+        settle: travel time of the blade, s; `open` and `close` wait for it.
+
+    Raises:
+        DeviceRefused: a settling time that is negative or not finite.
+    """
+
+    by_hand = False
+
+    def __init__(
+        self, output: DigitalOutput, clock: Clock, *, open_high: bool = True, settle: float = 0.0, name: str = "shutter"
+    ) -> None:
+        self.name = name
+        if not (math.isfinite(settle) and settle >= 0):
+            raise DeviceRefused(name, f"the settling time of {settle} s is not valid", expected="0 or more seconds")
+        self._output, self._clock, self._open_high, self._settle = output, clock, open_high, settle
+        self._open: bool | None = None  # level last sent; None before the first command, and after a failure
+
+    def open(self) -> None:
+        """Open and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
+        if self._open is None or not self.is_open():
+            self._put(True)
+
+    def close(self) -> None:
+        """Close and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
+        self._put(False)
+
+    def is_open(self) -> bool:
+        """Whether the output holds the open level; without read-back, whether `open` was the last command sent.
+
+        False before the first command. Raises DeviceError.
+        """
+        level = self._output.get()
+        return self._open is True if level is None else level is self._open_high
+
+    def _put(self, opened: bool) -> None:
+        self._open = None
+        level = opened is self._open_high
+        try:
+            self._output.set(level)
+            self._clock.sleep(self._settle)
+            held = self._output.get()
+        except DeviceError as cause:
+            wanted = "high" if level else "low"
+            raise DeviceError(
+                self.name,
+                f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",
+                request=cause.request or f"{self._output.name} {wanted}",
+                reply=cause.reply,
+                expected=cause.expected or f"{wanted} on {self._output.name}",
+                advice=cause.advice or "Check the controller's power and cable",
+                state=NOT_KNOWN,
+                wire=cause.wire,
+            ) from cause
+        if held is not None and held is not level:
+            raise DeviceError(
+                self.name,
+                f"the output {self._output.name} does not hold the level that was set",
+                request="high" if level else "low",
+                reply="high" if held else "low",
+                expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",
+                advice="Check the output's number, its wiring for a short, and that no other program sets it",
+                state=NOT_KNOWN,
+            )
+        self._open = opened
+
+
+Ask = Callable[[str], None]
+"""Shows the operator a request and returns once it is confirmed; raises the caller's own error otherwise."""
+
+
+class _Manual:
+    """A device that the operator moves; `_state` is what he has confirmed last.
+
+    None: not known, as while the operator is asked, and after a request that was not confirmed.
+    """
+
+    _name = ""
+
+    def __init__(self, ask: Ask, name: str = "") -> None:
+        self.name, self._ask = name or self._name, ask
+        self._state: Any = None
+
+    def _bring(self, state: object, request: str) -> None:
+        """Ask for a state, unless it is the present one."""
+        if self._state != state:
+            self._state = None
+            self._ask(request)
+            self._state = state
+
+
+class ManualShutter(_Manual):
+    """Implements `drivers.base.protocols.Shutter` by asking the operator.
+
+    The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
+    if the state changes.
+    """
+
+    by_hand = True
+    _name = "shutter"
+
+    def open(self) -> None:
+        self._bring(True, "Open the beam shutter.")
+
+    def close(self) -> None:
+        self._bring(False, "Close the beam shutter.")
+
+    def is_open(self) -> bool:
+        """The state last confirmed; False before the first confirmation, the safe assumption for a measurement."""
+        return self._state is True
+
+
+class ManualSampleMover(_Manual):
+    """Implements `drivers.base.protocols.SampleMover` by asking the operator; the sample starts in the beam."""
+
+    _name = "sample mover"
+
+    def __init__(self, ask: Ask, name: str = "") -> None:
+        super().__init__(ask, name)
+        self._state = "in"
+
+    def out(self) -> None:
+        self._bring("out", "Move the sample out of the beam.")
+
+    def back(self) -> None:
+        self._bring("in", "Move the sample back into the beam, to the same place.")
+
+
+class ManualFilter(_Manual):
+    """Implements `drivers.base.protocols.Filter` by asking the operator; which one is in at the start is not known."""
+
+    _name = "filter"
+
+    def put(self, place: str) -> None:
+        self._bring(place, f"Put the filter into the beam: {place}.")
+
+    def place(self) -> str | None:
+        place: str | None = self._state
+        return place
+
+
+class ManualMonochromator(_Manual):
+    """Implements `drivers.base.protocols.Monochromator` by asking the operator; the first energy is not known."""
+
+    _name = "monochromator"
+
+    def move_to(self, energy: float) -> None:
+        self._bring(energy, f"Set the monochromator to {energy:.7g} keV.")
+
+    def energy(self) -> float | None:
+        energy: float | None = self._state
+        return energy

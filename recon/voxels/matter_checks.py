@@ -1,0 +1,354 @@
+"""Checks of the matter in a volume: mass where views show none, structure left in the views, weak matter lost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import (
+    binary_closing,
+    binary_dilation,
+    binary_erosion,
+    binary_opening,
+    find_objects,
+    gaussian_filter,
+    label,
+)
+
+from recon.base.arrays import F32, Mask
+from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights, masked
+from recon.base.noise import air_level, noise_level, ring_offsets
+from recon.base.views import spread
+from recon.base.volume import Grid, Volume, part_of
+from recon.voxels.fbp import fbp, fbp_memory, is_gridded
+from recon.voxels.projector import Projector, seen_rays
+from recon.voxels.resolution import at_voxel_resolution
+from recon.voxels.view_weights import seen_by
+
+STRAY_LIMIT = 0.05
+"""Share of the mass above which a volume is told, see docs/published.md."""
+
+_VIEWS, _AGREE = 24, 2  # looked at; that must show a voxel empty
+_BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005  # pixels; of the blurred noise; of the 99th percentile of line integrals
+_WHOLE = 0.999  # share of a voxel's rays through air
+_MOST, _MOST_WHOLE = 2**18, 2**21  # voxels looked at, or one slice; where rows show no slices, those of a volume
+_WORK = 40  # bytes of a voxel that is looked at
+_LEAST_AIR = 100  # voxels whose level counts
+_MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it that counts
+
+
+@dataclass(frozen=True, eq=False)
+class StrayMass:
+    """Mass of a volume in the voxels that views show to be empty.
+
+    Attributes:
+        empty: share of the voxels that are shown to be empty.
+        share: of the volume's mass that lies in them, counting densities above a twentieth of the density unit.
+        map: float32 [y, x], the highest density above each other in these voxels.
+        first: number of the first slice that was looked at.
+        air: bool [slice, y, x], those of these voxels that every view looked at sees: beyond, FBP means nothing.
+    """
+
+    empty: float
+    share: float
+    map: F32
+    first: int
+    air: Mask
+
+    def level(self, volume: Volume) -> tuple[float, float]:
+        """Mean and standard deviation of a volume on the same grid in `air`; NaN where that has under 100 voxels."""
+        values = volume.data[self.first : self.first + len(self.air)][self.air]
+        if values.size < _LEAST_AIR:
+            return math.nan, math.nan
+        return float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
+
+
+def stray_mass(
+    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | RayWeights | None = None
+) -> StrayMass | None:
+    """Density in the voxels that views show to be empty; of a large volume, in slices around its middle.
+
+    Args:
+        volume: of any method.
+        weights: of rays [view, row, col]; rays of weight 0 show nothing.
+
+    Returns:
+        None if no voxel is shown to be empty, the volume holds no matter, or it is large and its slices are no rows.
+    """
+    nz, looked_at, first = volume.grid.shape[0], _looked_at(geometry, volume.grid), 0
+    if looked_at == 0:
+        return None
+    if nz > looked_at:
+        first = (nz - looked_at) // 2
+        band = slice(first, first + looked_at)
+        geometry, projections = geometry.rows(band.start, band.stop), projections[:, band]
+        weights = None if weights is None else weights[:, band]
+        volume = Volume(np.ascontiguousarray(volume.data[band]), Grid.matching(geometry))
+    empty, by_all = _empty_and_seen(projections, geometry, volume.grid, weights)
+    matter = np.maximum(volume.data, 0)
+    positive = matter[matter > 0]
+    if not empty.any() or not positive.size:
+        return None
+    stray = np.where(empty & (matter > _FAINT * np.percentile(positive, _MATTER)), matter, 0)
+    share = float(stray.sum(dtype=np.float64) / matter.sum(dtype=np.float64))
+    return StrayMass(float(empty.mean()), share, stray.max(axis=0), first, empty & by_all)
+
+
+def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
+    """Bytes that `stray_mass` takes beside projections and volume, about."""
+    slices = _looked_at(geometry, grid)
+    rows = min(slices, geometry.detector_shape[0]) if slices < grid.shape[0] else geometry.detector_shape[0]
+    rays = min(geometry.n_views, _VIEWS) * rows * geometry.detector_shape[1]
+    return _WORK * slices * grid.shape[1] * grid.shape[2] + 8 * rays
+
+
+def stray_mass_share(geometry: Geometry, grid: Grid) -> float:
+    """About how many projections of all rays take as long as `stray_mass`."""
+    return 3 * min(1.0, _VIEWS / geometry.n_views) * _looked_at(geometry, grid) / grid.shape[0]
+
+
+def _looked_at(geometry: Geometry, grid: Grid) -> int:
+    """Slices of the volume; 0 if it is not looked at."""
+    nz, slice_ = grid.shape[0], grid.shape[1] * grid.shape[2]
+    if geometry.rows_show_slices and grid == Grid.matching(geometry):
+        return min(nz, max(1, _MOST // slice_))
+    return nz if nz * slice_ <= _MOST_WHOLE else 0
+
+
+def seen_empty(projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None = None) -> Mask:
+    """[z, y, x] voxels whose rays in at least two of up to 24 views meet no matter.
+
+    A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
+    within 0.5 % of the thick parts. So matter much thinner than that counts as none.
+    """
+    return _empty_and_seen(projections, geometry, grid, weights)[0]
+
+
+def _empty_and_seen(
+    projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None
+) -> tuple[Mask, Mask]:
+    """As `seen_empty`, and the voxels that are on the detector in all of these views, [z, y, x] each."""
+    some = spread(np.arange(geometry.n_views), _VIEWS)
+    data, known = masked(projections[some], None if weights is None else weights[some])
+    noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur
+    limit = max(_SIGMAS * noise, _LEAST * float(np.percentile(data, 99)))
+    views = replace(geometry.select(some), skew=0.0) if geometry.skew else geometry.select(some)
+    votes, by_all = np.zeros(grid.shape, np.int16), np.ones(grid.shape, bool)
+    for view, image in enumerate(data):
+        air = gaussian_filter(image, _BLUR) < limit
+        if known is not None:
+            air &= known[view] > 0
+        one = Projector(views.select([view]), grid)
+        through_all = one.adjoint(np.ones((1, *air.shape), np.float32))
+        by_all &= through_all > 0
+        if not air.any():
+            continue
+        through_air = one.adjoint(air[None].astype(np.float32))
+        votes += (through_all > 0) & (through_air >= np.float32(_WHOLE) * through_all)
+    return votes >= _AGREE, by_all
+
+
+UNEXPLAINED_LIMIT = 0.007
+"""Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
+edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md).
+"""
+
+_SIGNIFICANT = 4.0  # standard deviations of the noise, above which noise has a share below 1e-3
+_FLIPS = 6
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: size of the detail, and of the map of the noise
+_ROWS, _COLS = 8, 256  # rows used, for so many columns; fewer for wider detectors
+_LEAST_VIEWS = 16
+_DENSE, _CLOSED = 0.2, 2  # share of the 99th percentile; voxels: cracks belong to the matter
+
+
+@dataclass(frozen=True, eq=False)
+class Unexplained:
+    """The residual of the views, back-projected on some slices of a volume.
+
+    Attributes:
+        share: of the voxels of matter with a residual above four standard deviations of its noise.
+        first: number of the first of these slices.
+        significance: float32 [z, y, x], filtered back-projection of the residual over its noise; positive where the
+        volume is too low.
+    """
+
+    share: float
+    first: int
+    significance: F32
+
+
+def unexplained(
+    volume: Volume,
+    projections: F32,
+    geometry: Geometry,
+    rng: np.random.Generator,
+    weights: F32 | RayWeights | None = None,
+) -> Unexplained | None:
+    """Filtered back-projection of the residual p - A x, over its noise: that of the views with random signs.
+
+    Random signs of the views cancel structure, which all views share, and keep noise [our own; after the odd-even
+    differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around the middle of matter
+    (of views that climb, those that see most of it) are used, one row if the detector has 700 columns or more.
+
+    Args:
+        volume: on the slices of the detector rows, 1/mm.
+        weights: of the rays; rays of weight 0 were not measured, and are not used.
+
+    Returns:
+        None for cones, rolled or tilted views, fewer than 16 views, other slices, or a volume without matter.
+    """
+    slices, same = volume.grid.shape[0], volume.grid == Grid.matching(geometry)
+    if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
+        return None
+    n = min(_rows_looked_at(geometry), slices)
+    mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
+    middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
+    first = min(max(middle - n // 2, 0), slices - n)
+    if geometry.climbs:  # few views see the slices in between
+        at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
+        seen = np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid")
+        first = int(seen.argmax())
+    rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
+    part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
+    level = _DENSE * float(np.percentile(part.data, 99))
+    matter = np.stack([binary_closing(image > level, iterations=_CLOSED) for image in part.data])
+    if level <= 0 or not matter.any():
+        return None
+    measured, projector = projections[:, rows], Projector(views, part.grid)
+    unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
+    if weights is not None:
+        unseen = unseen | (weights[:, rows] == 0)
+    lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, as the model is
+    left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
+    left = left - projector.forward(part.data)
+    left[unseen] = 0
+    left -= ring_offsets(left, views)
+    left[unseen] = 0
+
+    signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
+    kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
+    first_kind, *flipped = _fbp_of_each(left, kinds, views, box)
+    found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
+    for images in flipped:
+        variance += _smoothed(images) ** 2 / _FLIPS
+    noise = np.sqrt(gaussian_filter(variance, (0, _AROUND, _AROUND)))
+    significance = np.divide(found, noise, out=np.zeros_like(found), where=noise > 0)
+    return Unexplained(float(np.mean(np.abs(significance[matter]) > _SIGNIFICANT)), first, significance)
+
+
+def unexplained_memory(geometry: Geometry) -> int:
+    """Bytes that `unexplained` takes beside projections and volume, about."""
+    n, views, cols = _rows_looked_at(geometry), geometry.n_views, geometry.detector_shape[1]
+    slices = (1 + _FLIPS) * n
+    gridded = is_gridded(replace(geometry, detector_shape=(slices, cols)), Grid((slices, cols, cols)), "hann")
+    return 4 * n * cols * (13 * cols + 8 * views) + (fbp_memory(views, cols) if gridded else 80 * views * cols)
+
+
+def _rows_looked_at(geometry: Geometry) -> int:
+    rows, cols = geometry.detector_shape
+    return min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
+
+
+def _smoothed(images: F32) -> F32:
+    return gaussian_filter(images, (0, _SMOOTH, _SMOOTH))
+
+
+def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
+    """The slices of the box, of the residual times each row of signs [kind, view].
+
+    If views do not move along the axis, all are slices of one volume, which takes less time.
+    """
+    rows, cols = views.detector_shape
+    kinds = len(signs)
+    if views.shifts[:, 1].any():
+        signed = (np.asarray(residual * sign[:, None, None], np.float32) for sign in signs)
+        return [fbp(data, views, box, filter="hann") for data in signed]
+    views = views.at_row((rows - 1) / 2)
+    stacked = replace(views, detector_shape=(kinds * rows, cols), axis_row=(kinds * rows - 1) / 2)
+    data = np.multiply(residual[:, None], signs.T[:, :, None, None], dtype=np.float32).reshape(-1, kinds * rows, cols)
+    images = fbp(data, stacked, filter="hann")
+    return list(images.reshape(kinds, rows, *images.shape[1:]))
+
+
+_BLOCKS = 96  # blocks of a volume along its longest side, at most
+_SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # blocks; of air
+_MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
+_LEAST_AIR_BLOCKS = 100  # blocks
+_LEFT = 0.5  # share of FBP's density: a voxel with less has lost it
+_CORE = 3, 5, 5  # blocks along z, y and x of the boxes that a region is made of
+_LEAST_REGION = 64  # blocks of a region
+_BESIDE = 2  # blocks beside slices without beam that these are smoothed into
+
+
+@dataclass(frozen=True)
+class LostMatter:
+    """The matter that an FBP of the same views shows and a volume lacks.
+
+    Attributes:
+        lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.
+        kept: mass in that region over the mass in FBP, each above its own air.
+    """
+
+    lost: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
+    kept: float = 1.0
+
+
+def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> LostMatter | None:
+    """The largest region in which a volume lost weak matter that the reference shows above its own air.
+
+    In blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
+    of 3 x 5 x 5 blocks [z, y, x]: streaks are thinner.
+
+    Args:
+        volume: [z, y, x], of any method.
+        reference: [z, y, x], FBP or FDK.
+        seen: [z], slices of rows that got beam, which alone are compared: in others FBP shows a filling. None: all.
+
+    Returns:
+        None if the reference shows no air.
+    """
+    factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
+    factor = min(factor, *volume.shape)
+    shown, found = _blocks(reference, factor), _blocks(volume, factor)
+    ny, nx = shown.shape[1:]
+    y, x = np.mgrid[:ny, :nx]
+    disc = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
+    inside = np.repeat(disc[None], len(shown), axis=0)
+    if seen is not None:
+        blocks = seen[: len(shown) * factor].reshape(-1, factor).all(axis=1)
+        inside &= binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
+    smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in shown.shape]
+    shown, found = (gaussian_filter(values, smooth, mode="nearest") for values in (shown, found))
+    if not inside.any():
+        return None
+    level, noise = air_level(shown[inside])
+    matter = (shown - level > _ABOVE_AIR * noise) & inside
+    air = inside & ~binary_dilation(matter, iterations=_MARGIN)
+    if noise == 0 or air.sum() < _LEAST_AIR_BLOCKS:
+        return None
+    own = float(found[air].mean(dtype=np.float64))
+    comparison = LostMatter()
+    gone = matter & (found - own < _LEFT * (shown - level))
+    core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
+    parts, n = label(binary_opening(gone, np.ones(core)))
+    sizes = np.bincount(parts.ravel())[1:]
+    if not n or sizes.max() < _LEAST_REGION:
+        return comparison
+    at = int(sizes.argmax())
+    region = parts == at + 1
+    kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
+    spans = tuple((part.start * factor, part.stop * factor) for part in find_objects(parts)[at])
+    return LostMatter((spans[0], spans[1], spans[2]), kept)
+
+
+def _blocks(volume: F32, factor: int) -> F32:
+    """Means of blocks of so many voxels a side; voxels at the ends that do not fill a block are dropped."""
+    nz, ny, nx = (n // factor for n in volume.shape)
+    blocks = np.empty((nz, ny, nx), np.float32)
+    for z in range(nz):
+        image = volume[z * factor : (z + 1) * factor, : ny * factor, : nx * factor].mean(axis=0, dtype=np.float32)
+        blocks[z] = image.reshape(ny, factor, nx, factor).mean(axis=(1, 3))
+    return blocks

@@ -1,1 +1,0 @@
-"""Iterative methods on voxels, one a file."""

@@ -1,0 +1,287 @@
+"""The open beam: its bends, its current, what cuts it off, and what crosses it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from simulators.effects.chain import VISIBLE, Anomaly, ImageEffect, Label, Views, lit_share, within
+from simulators.frame.mapping import BelowOne, NotNegative, Positive, Whole
+from simulators.frame.shot import Image, Shot
+
+
+@dataclass(frozen=True)
+class BeamBend(ImageEffect):
+    """With the sample in the beam, -log of each ray's light changes by level + drift t + Σ curvature x².
+
+    x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t in s since the camera
+    was connected. Flats and darks stay as they are. Negative: the views have more light than the flats predict.
+
+    Attributes:
+        curvature: (horizontal, vertical), at the edges of the frame.
+        level: everywhere.
+        drift: everywhere, 1/s.
+    """
+
+    curvature: tuple[float, float] = (0.0, 0.0)
+    level: float = 0.0
+    drift: float = 0.0
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if not shot.sample:
+            return image
+        down, across = ((2 * (np.arange(n) + 0.5) / n - 1) ** 2 for n in image.shape)
+        image *= np.exp(-self.curvature[1] * down)[:, None]
+        image *= np.exp(-self.curvature[0] * across - self.level - self.drift * shot.elapsed)
+        return image
+
+
+@dataclass(frozen=True)
+class RingCurrent(ImageEffect):
+    """The current decays as exp(-t/lifetime) and returns to full at each top-up. The ring is full when the camera is
+    connected.
+
+    A frame gets the mean current over its exposure, in closed form: consecutive exposures collect the same light as one
+    long exposure.
+
+    Attributes:
+        lifetime: s to fall to 1/e.
+        top_up_every: s from the start of one top-up to the start of the next; None: not periodic.
+        top_up_below: share of the full current at which a top-up starts; None: not by the current. Without either the
+            current only decays.
+        refill: s that a top-up takes, with a linearly rising current; 0: it is instantaneous.
+    """
+
+    lifetime: Positive
+    top_up_every: Positive | None = None
+    top_up_below: Annotated[float, Field(gt=0, lt=1)] | None = None
+    refill: NotNegative = 0.0
+
+    def __post_init__(self) -> None:
+        if self.top_up_every is not None and self.top_up_below is not None:
+            raise ValueError("top_up_every and top_up_below exclude each other; give one of them")
+        if self.refill > 0 and not self.tops_up:
+            raise ValueError(f"refill must be 0 s without top_up_every or top_up_below, got {self.refill} s")
+        if self.top_up_every is not None and not self.top_up_every > self.refill:
+            raise ValueError(f"top_up_every must be longer than refill, got {self.top_up_every} and {self.refill} s")
+
+    @property
+    def tops_up(self) -> bool:
+        return self.top_up_every is not None or self.top_up_below is not None
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        image *= self.mean(shot.elapsed, shot.exposure)
+        return image
+
+    def mean(self, start: float, duration: float) -> float:
+        """Mean share of the full current over `duration` s from `start`, s since the camera was connected."""
+        if not self.tops_up:
+            x = duration / self.lifetime
+            return math.exp(-start / self.lifetime) * (-math.expm1(-x) / x if x > 0 else 1.0)
+        start %= self._falls() + self.refill  # within its cycle: differences of small numbers lose fewer digits
+        return (self._charge(start + duration) - self._charge(start)) / duration
+
+    def _charge(self, time: float) -> float:
+        """Integral of the share from 0 to `time`, s."""
+        falls = self._falls()
+        least = math.exp(-falls / self.lifetime)
+        whole = self._fallen(falls) + (1 + least) / 2 * self.refill
+        cycles, rest = divmod(time, falls + self.refill)
+        risen = max(rest - falls, 0.0)
+        slope = (1 - least) / self.refill if self.refill else 0.0
+        return cycles * whole + self._fallen(min(rest, falls)) + least * risen + slope * risen**2 / 2
+
+    def _falls(self) -> float:
+        """s of each cycle in which the current falls."""
+        if self.top_up_below is not None:
+            return -self.lifetime * math.log(self.top_up_below)
+        assert self.top_up_every is not None  # called only for a ring that is topped up
+        return self.top_up_every - self.refill
+
+    def _fallen(self, time: float) -> float:
+        return -self.lifetime * math.expm1(-time / self.lifetime)
+
+
+@dataclass(frozen=True)
+class LostBeam(ImageEffect, Anomaly):
+    """The beam is off for a range of views or of time; a frame loses the light of the overlap.
+
+    Attributes:
+        views: [first, one after the last]; flats taken just before one of them lose their light, too.
+        seconds: [from, to] since the camera was connected.
+        share: of the light that is left.
+    """
+
+    views: Views | None = None
+    seconds: tuple[float, float] | None = None
+    share: BelowOne = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.views is None) == (self.seconds is None):
+            raise ValueError("a lost beam needs either views or seconds, and not both")
+        if self.seconds is not None and not self.seconds[0] < self.seconds[1]:
+            raise ValueError(f"seconds must be [from, to] with from < to, got {list(self.seconds)}")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        lost = self._lost(shot)
+        if lost > 0:
+            image *= 1 - lost
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        return [Label(self.name, (0, rows, 0, cols))] if shot.beam and self._lost(shot) > 0 else []
+
+    def _lost(self, shot: Shot) -> float:
+        """Share of the frame's light that is lost."""
+        if self.seconds is None:
+            return 1 - self.share if within(self.views, shot) else 0.0
+        # In seconds of this exposure, so that rounding cannot remove more than all light.
+        begin, end = (at - shot.elapsed for at in self.seconds)
+        off = min(end, shot.exposure) - max(begin, 0.0)
+        return (1 - self.share) * max(off, 0.0) / shot.exposure
+
+
+@dataclass(frozen=True)
+class Ghost(ImageEffect, Anomaly):
+    """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
+
+    An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
+    view has. Its cause is unknown. It may brighten (light scattered into the detector) or darken.
+
+    Attributes:
+        view: the first view that shows it, at the right edge.
+        width: mm, full width at half height; it ends `width` from its middle.
+        speed: mm to the left from one view to the next.
+        gain: relative change of the light in its middle; negative for a dark ghost.
+    """
+
+    view: Whole
+    width: Positive
+    speed: Positive
+    gain: Annotated[float, Field(ge=-1)] = 0.3
+
+    def __post_init__(self) -> None:
+        if self.gain == 0:
+            raise ValueError("gain must be other than 0, which shows nothing")
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        first, change = self._change(shot)
+        image[:, first : first + change.size] *= 1 + change
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        first, change = self._change(shot)
+        visible = np.flatnonzero(np.abs(change) >= VISIBLE)
+        if not shot.beam or not visible.size:
+            return []
+        return [Label(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))]
+
+    def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
+        """The first column that it covers, and the relative change of the light from there to the right."""
+        cols, pitch = shot.detector.shape[1], shot.detector.pitch
+        if not shot.sample or shot.view < self.view:
+            return 0, np.zeros(0)
+        # The middle, in columns: half a step after the hump's left end has touched the frame's right edge.
+        middle = cols - 0.5 + (self.width - self.speed * (shot.view - self.view + 0.5)) / pitch
+        reach = self.width / pitch
+        first = max(0, math.ceil(middle - reach))
+        away = (np.arange(first, min(cols, math.floor(middle + reach) + 1)) - middle) / reach
+        return first, self.gain * np.cos(0.5 * np.pi * away) ** 2
+
+
+@dataclass(frozen=True)
+class BlackBand(ImageEffect, Anomaly):
+    """The band's edge is soft by the penumbra of the source; flats have the band too.
+
+    Attributes:
+        width: mm from the left edge of the frame, for any ROI, to half of the light.
+        penumbra: mm over which the light rises from none to all.
+        share: of the light that is left in the band.
+        views: [first, one after the last] in which the slit is in the beam; None: all.
+    """
+
+    width: Positive
+    penumbra: NotNegative = 0.0
+    share: BelowOne = 0.0
+    views: Views | None = None
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        if within(self.views, shot):
+            light = self._light(shot)
+            image[:, : light.size] *= light
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        cols = self._light(shot).size if shot.beam and within(self.views, shot) else 0
+        return [Label(self.name, (0, shot.detector.shape[0], 0, cols))] if cols else []
+
+    def _light(self, shot: Shot) -> NDArray[np.float64]:
+        """Share of the light in each column of the band."""
+        from_left = (np.arange(shot.detector.shape[1], dtype=np.float64) + 0.5) * shot.detector.pitch
+        light = self.share + (1 - self.share) * lit_share(from_left - self.width, self.penumbra)
+        return light[light < 1]
+
+
+@dataclass(frozen=True)
+class NarrowField(ImageEffect, Anomaly):
+    """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
+
+    Flats are equally narrow. Pixels without full light get a label for each side: left, right, above and below.
+
+    Attributes:
+        width: mm of the rectangle across the beam, between the places with half of the light.
+        height: mm, vertically; None: the whole frame.
+        centre: mm of its middle, (across, down the rows) from the projected rotation axis and z = 0.
+        penumbra: mm over which the light rises from none to all.
+    """
+
+    width: Positive
+    height: Positive | None = None
+    centre: tuple[float, float] = (0.0, 0.0)
+    penumbra: NotNegative = 0.0
+
+    def apply(self, image: Image, shot: Shot) -> Image:
+        down, across = self._light(shot)
+        first, last = _lit_fully(across)
+        image[:, :first] *= across[:first]
+        image[:, last:] *= across[last:]
+        first, last = _lit_fully(down)
+        image[:first] *= down[:first, None]
+        image[last:] *= down[last:, None]
+        return image
+
+    def labels(self, shot: Shot) -> Sequence[Label]:
+        rows, cols = shot.detector.shape
+        (top, below), (left, right) = (_lit_fully(light, VISIBLE) for light in self._light(shot))
+        strips = [(0, rows, 0, left), (0, rows, right, cols), (0, top, 0, cols), (below, rows, 0, cols)]
+        return [
+            Label(self.name, strip, which)
+            for which, strip in enumerate(strips)
+            if shot.beam and strip[0] < strip[1] and strip[2] < strip[3]
+        ]
+
+    def _light(self, shot: Shot) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Shares of the light in each row and in each column; a pixel has their product."""
+        detector = shot.detector
+        across = self._between(detector.u() - self.centre[0], self.width)
+        if self.height is None:
+            return np.ones(detector.shape[0]), across
+        return self._between(detector.v() - self.centre[1], self.height), across
+
+    def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+        # The part of the source that neither edge covers. The edges cover it from opposite ends.
+        one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
+        return np.maximum(one + other - 1, 0.0)
+
+
+def _lit_fully(light: NDArray[np.float64], less: float = 0.0) -> tuple[int, int]:
+    """First pixel with at least 1 - `less` of the light and the one after the last; it falls off to both sides."""
+    full = np.flatnonzero(light >= 1 - less)
+    return (int(full[0]), int(full[-1]) + 1) if full.size else (light.size, light.size)
