@@ -33,15 +33,8 @@ from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
 from recon.splatting.train import trials_of
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out import (
-    LEAST_VIEWS,
-    TRIAL_ROWS,
-    busiest_rows,
-    middle_of_cone,
-    slab_of,
-    split_views,
-    unseen_residuals,
-)
+from recon.voxels.field_edges import busiest_rows, middle_of_cone, slab_of
+from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, split_views, unseen_residuals
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector, projection_lines
@@ -55,7 +48,7 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 
 
 class TrialsVerdict(NamedTuple):
-    """What trials tell.
+    """Result of trials.
 
     Attributes:
         best: number of the method to take; None: the trials ended before two were done.
@@ -188,7 +181,7 @@ def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) ->
 
 
 def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
-    """The problem of these views alone."""
+    """The problem with these views only."""
     weights = problem.use.weights
     return replace(
         problem, projections=problem.projections[views], geometry=problem.geometry.select(views),
@@ -294,7 +287,7 @@ class Auto:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """Of the trial that judges all candidates, or of one of each."""
+        """Work of the one trial that judges all candidates, or of a trial of each."""
         methods = [
             method.as_candidate() if isinstance(method, ChoosingMethod) else method for method in self.candidates
         ]

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, bin_views
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
 from recon.voxels.field_edges import wider_than_field
+from recon.voxels.held_out import predicted_views
 from recon.voxels.methods import FistaTv
-from recon.voxels.projector import Projector
 
 COLS = 128  # Columns that show the axis to 0.05 of their pixels; more cost time
 VIEWS = 90  # Views that are enough
@@ -42,7 +41,7 @@ def axis_by_views(
     near: bool = False,
     lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
-    """The column by which a volume of two thirds of the views leaves least of the others.
+    """The axis column with which a volume of two thirds of the views predicts the others best.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
     best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,
@@ -173,9 +172,6 @@ class _Judge:
             lit = None if lit is None else lit[first : first + height]
         self.binned, self._views = bin_views(np.ascontiguousarray(data), self.bin), views.binned(self.bin)
         self._lit = None if lit is None else bin_views(lit[None].astype(np.float32), self.bin) > _WHOLE
-        order = np.argsort(np.mod(views.angles, 2 * np.pi), kind="stable")
-        self._unseen = order[1::_ONE_IN]
-        self._seen = np.setdiff1d(order, self._unseen)
 
     def __call__(self, axis_col: float) -> float:
         if axis_col not in self.found:
@@ -188,15 +184,11 @@ class _Judge:
         views = replace(self._views, axis_col=self._views.axis_col + moved)
         if self._grid is None or not self.accuracy.one_grid:
             self._grid = Grid.matching(views).widened(self.width, views)
-        grid, method = self._grid, FistaTv(self.accuracy.sweeps, _TV_WEIGHT)
-        seen, unseen = self.binned[self._seen], self.binned[self._unseen]
-        lit = 1 if self._lit is None else self._lit
-        use = DataUse() if self._lit is None else DataUse(np.broadcast_to(self._lit, seen.shape).astype(np.float32))
-        part = ReconProblem(seen, views.select(self._seen), grid, use, 0, "cpu")
-        volume = method.run(part, RunControl()).volume
-        unseen = unseen * lit
-        left = unseen - Projector(views.select(self._unseen), grid).forward(volume.data) * lit
-        most = _norm(unseen)
+        method, lit = FistaTv(self.accuracy.sweeps, _TV_WEIGHT), 1 if self._lit is None else self._lit
+        unseen, images = predicted_views(method, self.binned, views, self._grid, self._lit, _ONE_IN)
+        measured = self.binned[unseen] * lit
+        left = measured - images * lit
+        most = _norm(measured)
         if most == 0:
             raise AxisError("the views held out show no matter, so that they tell nothing of the axis; give the axis")
         return _norm(left) / most

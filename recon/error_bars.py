@@ -134,7 +134,7 @@ def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
 
 
 def alternating(geometry: Geometry) -> F32:
-    """[view]: 1 and -1 in turns, in the order of the angles."""
+    """[view]: 1 and -1 alternating in the order of the angles."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     signs = np.empty(order.size, np.float32)
     signs[order] = 1 - 2 * (np.arange(order.size) % 2)
@@ -185,7 +185,7 @@ def _refitted(
 
 
 class _Refit(IterativeMethod, Method, Protocol):
-    """A method that goes on from a volume."""
+    """A method that continues from a volume."""
 
 
 def _refit(method: Method) -> _Refit:

@@ -55,7 +55,7 @@ def measured_rate(operation: str, now: Clock, threads: int = 1) -> Rate:
 
 
 def rate_of(timed: tuple[SizedRun, ...], now: Clock) -> Rate:
-    """By two sizes with rates of 0 or more: where one would be less, or of one size, the larger tells the other."""
+    """The two rates from runs of two sizes; where one rate would be negative, the larger run gives the other alone."""
     seconds = []
     for size in timed:
         size.run()

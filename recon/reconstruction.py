@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.base.declared_types import check_arguments
+from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views
 from recon.base.masks import RayWeights
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, SignedMethod
@@ -34,12 +34,12 @@ def reconstruct(
     method: str | Method = DEFAULT,
     *,
     grid: Grid | None = None,
-    seed: int = 0,
+    seed: Natural = 0,
     device: str = "cpu",
     use: DataUse | None = None,
     control: RunControl | None = None,
 ) -> Reconstruction:
-    """Line integrals to a volume.
+    """Reconstruct a volume from line integrals.
 
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
@@ -57,20 +57,16 @@ def reconstruct(
         control: how to watch, end and continue the reconstruction.
 
     Raises:
-        ValueError: for an unknown method, shapes that disagree, views from one side only, data without matter, or a
-        negative seed. Also for an argument that the method does not take: views held out, a device, checkpoints, or
-        these views.
+        ValueError: an unknown method, shapes that disagree, views from one side only, data without matter, a negative
+            seed, or views, views held out, a device or a checkpoint that the method does not take.
 
     Warns:
-        UserWarning: projections are not finite where weights do not leave them out. Angles look like degrees,
-            projections like counts or transmission, or, for a method that keeps no voxel below 0, like line integrals
-            of the other sign. The reconstruction goes on.
+        UserWarning: projections are not finite where weights do not leave them out, angles look like degrees,
+            projections like counts or transmission, or, where no voxel may be below 0, like -1 times line integrals.
     """
     check_arguments(reconstruct, locals())
     chosen = by_name(method)() if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
-    if seed < 0:
-        raise ValueError(f"seed must be a whole number of 0 or more, got {seed}")
     _refuse_foreign(chosen, device, use, control)
     _refuse_one_side(geometry)
     if isinstance(projections, Counts | Emission):
@@ -88,13 +84,14 @@ def reconstruct(
     _warn_of_unseen_cone(chosen, geometry, grid)
     begin = control.now()
     result = chosen.run(ReconProblem(data, geometry, grid, use, int(seed), device), control)
-    settings = MappingProxyType(dict(result.settings))
-    seconds = result.seconds or control.now() - begin
-    return replace(result, settings=settings, method=result.method or chosen.name, seconds=seconds)
+    return replace(
+        result, settings=MappingProxyType(dict(result.settings)), method=result.method or chosen.name,
+        seconds=result.seconds or control.now() - begin,
+    )  # fmt: skip
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
-    """Of values that are not finite, but for those that weights leave out."""
+    """Warn of values that are not finite, except those that weights leave out."""
     lost = sum(
         int((~np.isfinite(view) & (True if weights is None else np.asarray(weights[at] > 0))).sum())
         for at, view in enumerate(data)

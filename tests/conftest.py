@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -69,12 +71,41 @@ def _is_of_a_feature(path: Path) -> bool:
     return not _FEATURES.isdisjoint(path.parents)
 
 
+# Processor seconds of the quick tests of each file that takes a second or more, as `SPLATLINE_DURATIONS=FILE pytest` of
+# one process writes them. Only their order matters, so that they need not be those of this machine.
+_DURATIONS = Path(__file__).parent / "durations.json"
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m selects
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of features, which mirror their folders."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of features, which mirror their folders; workers take the longest files first, so that they end
+    together."""
     for item in items:
         if _is_of_a_feature(item.path):
             item.add_marker("feature")
+    if hasattr(config, "workerinput"):
+        seconds = json.loads(_DURATIONS.read_text(encoding="utf-8"))
+        items.sort(key=lambda item: -seconds.get(item.nodeid.partition("::")[0], 0.0))
+
+
+_SECONDS: defaultdict[str, float] = defaultdict(float)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Count the processor seconds of this process and of those that it has waited for."""
+    before = os.times()
+    done = yield
+    _SECONDS[item.nodeid.partition("::")[0]] += sum(os.times()[:4]) - sum(before[:4])
+    return done
+
+
+def pytest_sessionfinish() -> None:
+    if record := os.environ.get("SPLATLINE_DURATIONS"):
+        longest = sorted(((s, name) for name, s in _SECONDS.items() if s >= 1), reverse=True)
+        Path(record).write_text(
+            json.dumps({name: round(s, 1) for s, name in longest}, indent=0) + "\n", encoding="utf-8"
+        )
 
 
 @pytest.hookimpl(optionalhook=True)

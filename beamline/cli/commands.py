@@ -16,7 +16,7 @@ from recon.base.registry import Registry, in_folders
 
 
 class Libraries(Enum):
-    """What the libraries of some commands need, under a limit of addresses.
+    """Address space that the libraries of a command need, and modules to load before its data.
 
     Attributes:
         addresses: bytes that a command on a tiny scan takes at its peak, with one thread of BLAS, and a twentieth more;
@@ -35,7 +35,7 @@ class Libraries(Enum):
 
 @dataclass(frozen=True)
 class CommandEntry:
-    """Where a command is, and its help line.
+    """A command: the module that defines it, and its line in the help.
 
     Attributes:
         module: in which the command has its own name, "-" as "_".
@@ -62,19 +62,19 @@ def _core(module: str, help_line: str, libraries: Libraries = Libraries.NONE, *,
 
 
 CORE = {
-    "check": _core("config", "Validate a configuration. Nothing moves.", files=False),
-    "home": _core("home", "Search the stage's reference position. The stage turns."),
+    "check": _core("control", "Validate a configuration. Nothing moves.", files=False),
+    "home": _core("control", "Search the stage's reference position. The stage turns."),
     "scan": _core("scan", "Run a scan, or print its plan with --dry-run.", Libraries.FRAMES),
     "pause": _core("control", "Pause a running scan, from another terminal: no view is lost."),
     "resume": _core("control", "Let a paused scan go on."),
     "stop": _core("control", "Stop a running scan cleanly, from another terminal."),
     "abort": _core("control", "Abort a running scan at once, from another terminal."),
     "recon": _core("recon", "Reconstruct a scan, finished or still running.", Libraries.FITS),
-    "recover": _core("recover", "Make an ordinary scan file of one whose writer died."),
+    "recover": _core("control", "Make an ordinary scan file of one whose writer died."),
     "monitor": _core(
         "monitor", "Look at the frames of a scan file with the checks of the monitor.", Libraries.FRAMES, files=False
     ),
-    "config": _core("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
+    "config": _core("control", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 """What acquires, watches and reconstructs, in the order of the help."""
 
@@ -92,7 +92,7 @@ def own_commands() -> dict[str, CommandEntry]:
 
 @cache
 def commands() -> Registry[CommandEntry]:
-    """All commands, with those of other packages, which are asked only where a name is not ours."""
+    """All commands. Other packages are searched only for names that are not ours."""
     return Registry("command", own_commands(), _entry_of)
 
 

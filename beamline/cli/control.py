@@ -1,12 +1,25 @@
-"""`beamline pause`, `resume`, `stop` and `abort`: verbs to a running scan from another terminal."""
+"""Commands of configurations, runs, the stage and broken scans: `config`, `check`, `pause` ..., `home`, `recover`."""
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from beamline.core.errors import ConfigError
+from beamline.cli.options import POSITIVE, config_argument, json_events, json_option, set_option
+from beamline.core.errors import INTERRUPTED, ConfigError
+from beamline.core.events import Done, Sink
+from beamline.core.stop import terminated_like_interrupted
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError
+
+if TYPE_CHECKING:
+    from beamline.storage.recover import Recovered
 
 _EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
 
@@ -61,3 +74,145 @@ def _only(runs: Path) -> Path:
     if len(running_scans) == 1:
         return running_scans[0]
     raise ConfigError(f"{_running_in(runs)}. Name the folder of the run. Nothing was changed.")
+
+
+@click.command()
+@config_argument
+@click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
+@click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Longest time of the search, s.")
+@set_option
+def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
+    """Search the reference position of the stage in CONFIG.
+
+    THE STAGE TURNS, possibly by a full turn and beyond its soft limits. No other device is connected. Ctrl-C stops
+    the stage.
+
+    Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
+    """
+    from beamline.config.load import load
+    from beamline.instrument.connect import stage_alone
+
+    config = load(file, overrides)
+    stage_config = config.devices.stage
+    if not yes:
+        way = f"The {stage_config.kind} stage at {stage_config.port} will turn to find its reference. May it turn?"
+        try:
+            free = click.confirm(way, err=True)
+        except click.Abort:  # Ctrl-C, or the end of input: there is no operator
+            click.echo(err=True)
+            free = False
+        if not free:
+            click.echo(
+                "beamline: The search was not confirmed. Nothing has moved. Use --yes to search without a question.",
+                err=True,
+            )
+            click.get_current_context().exit(INTERRUPTED)
+    with terminated_like_interrupted(), stage_alone(config) as stage:
+        try:
+            stage.start_home()
+            angle = stage.wait(timeout)
+        except BaseException:
+            # Also after a search that failed: the state of the controller is not known. The first error is reported.
+            with suppress(DeviceError):
+                stage.stop()
+            raise
+        click.echo(f"The stage has found its reference and is at {math.degrees(angle):.4f} deg.")
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@json_option
+def recover(file: Path, as_json: bool) -> None:
+    """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
+
+    Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. It can be
+    run again after whatever stopped it, needs no room for a copy, and says what room it needs.
+    """
+    from beamline.core.files import SCAN
+    from beamline.scan.resume import recover_run
+    from beamline.storage.parts import JOINED
+    from beamline.storage.recover import recover as recover_scan
+
+    def say(what: str) -> None:
+        click.echo(what, err=True)
+
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
+        recovered, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
+        recovered_files(recovered, left_out, sink, as_json)
+
+
+def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
+    """Tell of each file of a run that was recovered, and of the parts that were left out."""
+    for sentence in left_out:
+        click.echo(f"Warning: {sentence}", err=True)
+    for done in recovered:
+        sink(Done(done, time=SystemClock().now()))
+        if not as_json:
+            click.echo(done.in_words())
+
+
+@click.group()
+def config() -> None:
+    """Print a configuration template, a complete configuration, or the schema."""
+
+
+@config.command(short_help="Print a configuration template to edit.")
+@click.option("--instrument", is_flag=True, help="A template for a real instrument instead of simulated devices.")
+@click.argument("file", metavar="", required=False)
+def init(instrument: bool, file: str | None) -> None:
+    """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
+    if file is not None:
+        raise click.UsageError(f"config init prints a configuration and writes no file: beamline config init > {file}")
+    from beamline.config.load import config_folder
+
+    name = "instrument.yaml" if instrument else "simulated.yaml"
+    click.echo((config_folder() / name).read_text(encoding="utf-8"), nl=False)
+
+
+@config.command(short_help="Print a configuration with all defaults.")
+@config_argument
+@set_option
+def show(file: Path, overrides: tuple[str, ...]) -> None:
+    """Print CONFIG as a scan would use it: with all defaults, --set and BEAMLINE_* variables applied."""
+    from beamline.config.load import load, resolved_yaml
+
+    click.echo(resolved_yaml(load(file, overrides)), nl=False)
+
+
+@config.command("schema", short_help="Print the JSON schema of a configuration.")
+def print_schema() -> None:
+    """Print the JSON schema of a configuration, for editors that complete and check YAML files."""
+    from beamline.config.load import schema
+
+    click.echo(json.dumps(schema(), indent=2))
+
+
+@click.command()
+@config_argument
+@set_option
+@click.option("--rehearse", is_flag=True, help="As `beamline scan --rehearse` would run it.")
+@json_option
+def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool) -> None:
+    """Validate CONFIG. Nothing moves.
+
+    Prints the timeline of the scan: speed, taxi, angular step in counts, motion blur and rolling-shutter skew in
+    pixels, duration, bytes to write and free disk space.
+
+    Exit code: 0 valid, 2 wrong configuration or violated limit.
+    """
+    from beamline.config.load import load
+    from beamline.scan.preflight import doubts, dry_run, refuse_violations
+
+    with json_events(as_json) as sink:
+        loaded = load(file, overrides, rehearse=rehearse)
+        for sentence in doubts(loaded):
+            click.echo(f"Warning: {sentence}", err=True)
+        worked = dry_run(loaded)
+        if not as_json:
+            click.echo("\n".join(worked.lines()))
+        refuse_violations(worked.timeline)
+        sink(Done(worked.data(), time=SystemClock().now()))
+    if not as_json:
+        click.echo(f"\n{file} is valid: no limit is violated.")

@@ -9,7 +9,6 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
     POSITIVE,
     NameChoice,
@@ -21,6 +20,7 @@ from beamline.cli.options import (
     run_option,
     together,
 )
+from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
 from recon.assess.time_model import MODEL_STEPS, PRESETS, parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
@@ -34,21 +34,21 @@ PRESETS_OF_METHODS = ("published",)
 
 
 def checkpoint_output(path: Path) -> Path:
-    """The path, which names a file. ValueError for another."""
+    """The path of a checkpoint to write. ValueError for a path without a file name."""
     if not path.name:
         raise ValueError(f"{str(path)!r} is no file; name one, such as fit.checkpoint.h5")
     return path
 
 
 def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
-    """A callback: DataError if the file is not there."""
+    """Callback that checks a checkpoint to read. DataError if the file does not exist."""
     if path is not None and not path.exists():
         raise DataError(f"--{param.name} {path} is not there. Nothing was touched.")
     return path
 
 
 def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any]:
-    """The settings of methods in the values of a command's parameters, by their paths; takes them out of `values`."""
+    """Settings of methods by path, removed from the parameter values of a command."""
     taken = [(param.rule, values.pop(name)) for name, param in declared(command).items() if param.rule.setting]
     return {rule.setting: not value if rule.inverted else value for rule, value in taken if value is not None}
 
@@ -68,7 +68,7 @@ def row_settings(command: click.Command, methods: Sequence[str], values: dict[st
 
 
 def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str, Any] | None = None) -> Method:
-    """The method of this name, with those of the settings that it has.
+    """The method of this name with its settings; settings of other methods are ignored.
 
     Args:
         name: in `recon.methods`, or of `recon.Auto`.
@@ -89,7 +89,7 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
 
 
 def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
-    """NAME=VALUE, several in one text apart by spaces, as a value by name: JSON, or else text."""
+    """Settings by name, from texts of NAME=VALUE separated by spaces; values are JSON, else plain text."""
     settings: dict[str, Any] = {}
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")

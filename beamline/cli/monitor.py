@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import DATA, Grouped, heading
 from beamline.cli.options import json_option, others, scan_argument, set_by, set_option, with_request
+from beamline.cli.recipe import DATA, Grouped, heading
 from beamline.cli.selection_options import scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
@@ -23,8 +23,8 @@ from drivers.base.clock import Clock, SystemClock
 if TYPE_CHECKING:
     from beamline.monitor.check import Check, Level
     from beamline.monitor.references import ReferenceLimits
+    from beamline.projections.flagged_frames import ReturnedView
     from beamline.projections.replay import FrameVerdict, Kind, ScanVerdict
-    from beamline.projections.returned import ReturnedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +119,8 @@ def _watched(
     request: MonitorRequest, checks: Sequence[Check], limits: ReferenceLimits | None, sink: Sink, clock: Clock
 ) -> _Watched:
     """Look at every frame, report its flags, and write the picture of the worst ones if it is asked for."""
-    from beamline.projections.flagged_frames import worst_frames
+    from beamline.projections.flagged_frames import returned_views, worst_frames
     from beamline.projections.replay import replay, verdict
-    from beamline.projections.returned import returned_views
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
     from beamline.storage.rules.scan import scan_ended
@@ -151,7 +150,7 @@ def _watched(
         if request.sheet is not None:
             worst = worst_frames(source, FrameFlags.of_flags([judged.flags for judged in frames]))
             if worst:
-                from beamline.report.contact_sheet import contact_sheet
+                from beamline.report.sheets import contact_sheet
 
                 write_whole(request.sheet, contact_sheet(worst))
         return _Watched(summed, returned, ended, stopped())
@@ -168,7 +167,7 @@ def _facts(file: Path, summed: ScanVerdict, returned: Sequence[ReturnedView]) ->
 
 
 def table(kinds: Iterable[Kind]) -> list[str]:
-    """The flags for people, three lines a check and level."""
+    """Flags as text: three lines for each check and level."""
     from beamline.monitor.checks import CHECKS
 
     units, lines = {check.name: check.unit for check in CHECKS}, []

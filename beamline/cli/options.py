@@ -53,7 +53,7 @@ class WholeRange(click.IntRange):
 
 
 class NameChoice(click.Choice):  # type: ignore[type-arg]
-    """Some names; an error names the nearest one."""
+    """A choice of names whose error suggests the nearest one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
@@ -66,14 +66,14 @@ class NameChoice(click.Choice):  # type: ignore[type-arg]
 
 
 class MethodChoice(NameChoice):
-    """Names of methods; of one that another command takes, an error names that command."""
+    """A choice of methods whose error names the command that runs the method, if another one does."""
 
     def refusal(self, value: str) -> str:
         return unknown_method(value, self.choices)
 
 
 def unknown_method(name: str, legal: Iterable[str]) -> str:
-    """Why a method is not taken; without a full stop."""
+    """Why a method cannot be chosen here, without a full stop."""
     if (entry := METHODS.get(name)) is not None and entry.several in _ELSEWHERE:
         return f"{name!r} {_ELSEWHERE[entry.several]}"
     return unknown("method", name, legal)
@@ -93,7 +93,7 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class Declared(click.Option):
-    """An option that states, once and here, all that commands ask about it.
+    """A click option with its rule: what it excludes and needs, and whether recipes contain it.
 
     Args:
         rule: whose it is, and what it goes with; `excludes` and `needs` make one.
@@ -122,7 +122,7 @@ def option(*names: str, **facts: Any) -> Decorator:
 
 
 def run_option(name: str, *names: str, **facts: Any) -> Decorator:
-    """An option of a reconstruction, whose rule `beamline.reconstruct.option_rules` has by this long name."""
+    """An option of a reconstruction with its rule from `beamline.reconstruct.option_rules`."""
     return option(name, *names, rule=RULES[name.split("/")[0].lstrip("-")], **facts)
 
 
@@ -171,7 +171,7 @@ dataset_option = option("--dataset", help="Which array of an HDF5 file or .npz; 
 
 
 def new_folder_option(default: str) -> Decorator:
-    """The folder of a command that writes several files; `default` says which one it is without the option."""
+    """Option -o of a command that writes several files; `default` describes the folder without it."""
     where = click.Path(path_type=Path, file_okay=False)
     return option("-o", "--output", type=where, help=f"New folder for the results. Default: {default}, in this folder.")
 
@@ -209,7 +209,7 @@ def set_by(*options: Decorator | str, **facts: Any) -> Any:
 
 
 def others(*options: Decorator) -> Any:
-    """The field of a request that has the values of these options, which are no fields, by parameter name."""
+    """A request field that collects the values of these options by parameter name."""
     return field(metadata={"options": options})
 
 
@@ -255,7 +255,7 @@ def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parame
 
 
 def as_scan(ctx: click.Context, param: click.Parameter, value: Path) -> Path:
-    """A callback: the folder of a run stands for its scan with all parts."""
+    """Callback that replaces the folder of a run by its scan file with all parts."""
     from beamline.storage.interrupted import scan_file  # here: help needs none of it
 
     return scan_file(value)
@@ -324,5 +324,5 @@ def require_there(file: Path, as_json: bool) -> None:
 
 
 def say(line: str) -> None:
-    """A line with the time of day, on stderr."""
+    """Print a line with the time of day to stderr."""
     click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
-from beamline.cli.option_groups import Grouped
 from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, require_there, rules_of
-from beamline.cli.recipe import names_given, recipe_text, repeating
+from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
 from beamline.cli.terminal import closed_terminal_ignored, events_shown, results

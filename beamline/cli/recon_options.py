@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.method_options import method_options, preset_option
-from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -24,7 +23,7 @@ from beamline.cli.options import (
     together,
     volume_path,
 )
-from beamline.cli.recipe import config_option
+from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, config_option, heading
 from beamline.cli.selection_options import selection_options
 from beamline.storage.volumes.registry import suffixes_text
 from recon.base.choices import AUTO
@@ -45,7 +44,7 @@ def memory_size(text: str) -> int:
 
 def cluster_of(text: str) -> str:
     """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
-    from beamline.reconstruct.workers import cluster  # here: help needs none of it
+    from beamline.reconstruct.memory import cluster  # here: help needs none of it
 
     cluster().check_cluster(text)
     return text

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamline.cli.control import recovered_files
 from beamline.cli.options import json_events, json_option, set_by, set_option, with_request
-from beamline.cli.page_beside import PageBeside
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
 from beamline.core.files import remove
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from beamline.core.run_result import RunResult
     from beamline.scan.energies import SeriesRun
     from beamline.scan.resume import ResumableRun
+    from drivers.in_beam import Ask
 
 TABLE = ".csv"  # suffix of a table of scans
 
@@ -105,7 +106,7 @@ def scan(request: ScanRequest) -> None:
     but frames have an alarm of the monitor, or darks or flats a fault.
     """
     from beamline.config.load import load
-    from beamline.scan.resume import NotJoined, open_for_resume
+    from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
     file, run = request.file, request.run
     _refuse_contradictions(request)
@@ -125,7 +126,7 @@ def scan(request: ScanRequest) -> None:
         except NotJoined:
             if request.dry or run is None:
                 raise
-            _join(run, json_sink, request.as_json)
+            recovered_files(*recover_run(run), json_sink, request.as_json)
             return
         config = series.config if series else config
         assert config is not None
@@ -180,7 +181,16 @@ def _refuse_contradictions(request: ScanRequest) -> None:
         raise click.UsageError("--discard removes what a rehearsal made: give --rehearse.")
     if request.file is None and request.run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
-    _refuse_for_queue(request)
+    several = _are_several_scans(request.files)
+    for name, given, of_several in (
+        ("--resume", request.run is not None, False),
+        ("--page", request.page, False),
+        ("--documents", request.documents is not None, False),
+        ("--stop-on-failure", request.stop_on_failure, True),
+        ("--wait", request.wait, True),
+    ):
+        if given and of_several is not several:
+            raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
     if request.run is None:
         return
     if request.output is not None or (request.overrides and request.file is None):
@@ -204,17 +214,14 @@ def _queue() -> Any:
     return import_module(modules["scan"])
 
 
-def _refuse_for_queue(request: ScanRequest) -> None:
-    several = _are_several_scans(request.files)
-    for name, given, of_several in (
-        ("--resume", request.run is not None, False),
-        ("--page", request.page, False),
-        ("--documents", request.documents is not None, False),
-        ("--stop-on-failure", request.stop_on_failure, True),
-        ("--wait", request.wait, True),
-    ):
-        if given and of_several is not several:
-            raise click.UsageError(f"{name} is for {'several scans' if of_several else 'one scan'}.")
+@contextmanager
+def _shown(request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> Iterator[tuple[list[Sink], Ask]]:
+    """The terminal and the page beside a scan, as sinks before the `others`; and what asks the operator."""
+    from beamline.instrument.connect import ask_operator
+
+    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
+        sinks: list[Sink] = [terminal, *others, *([beside] if request.page else [])]
+        yield sinks, lambda question: terminal.ask(question, ask_operator)
 
 
 def run_one(
@@ -226,21 +233,17 @@ def run_one(
     stop: StopRequest | None = None,
 ) -> RunResult:
     """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
-    from beamline.instrument.connect import ask_operator
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
     stop, how = stop or StopRequest(), commands_of(config, series) if not request.no_live else Commands()
     if how.remark:
         click.echo(how.remark, err=True)
-    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-        sinks: list[Sink] = [terminal, *others, *([beside] if request.page else [])]
+    with _shown(request, others, stop) as (sinks, ask):
         if request.documents is not None:
             sinks.append(import_module("beamline.bluesky.documents").sink(config, request.documents, held))
-        return run_scan(
-            config, series or request.output, sinks, stop, live=how.live, afterwards=how.afterwards,
-            ask=lambda question: terminal.ask(question, ask_operator),
-        )  # fmt: skip
+        place = series or request.output
+        return run_scan(config, place, sinks, stop, live=how.live, afterwards=how.afterwards, ask=ask)
 
 
 def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
@@ -265,18 +268,15 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
 
 def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
     """Take, or go on with, a scan of each energy, with the terminal and the page beside it."""
-    from beamline.instrument.connect import ask_operator
     from beamline.scan.energies import run_energies
+    from beamline.scan.live_process import Commands, commands_of
 
     if request.discard:
         raise click.UsageError("--discard does not go with scan.energies: leave it out.")
-    from beamline.scan.live_process import Commands, commands_of
-
-    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
+    with _shown(request, others, stop) as (sinks, ask):
         return run_energies(
-            config, request.output, [terminal, *others, *([beside] if request.page else [])], stop,
-            lambda one, rest: Commands() if request.no_live else commands_of(one, rest),
-            series=request.run, ask=lambda question: terminal.ask(question, ask_operator),
+            config, request.output, sinks, stop,
+            lambda one, rest: Commands() if request.no_live else commands_of(one, rest), series=request.run, ask=ask,
         )  # fmt: skip
 
 
@@ -288,19 +288,6 @@ def _show_energies(done: SeriesRun, request: ScanRequest, json_sink: Sink) -> No
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
     if faults := [fault for result in done.results for fault in faults_of(result)]:
         raise AlarmError(f"The scans are complete, but {' '.join(faults)} Look at {done.folder}.")
-
-
-def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
-    """Join the files of a run that has all its frames, and report it as `beamline recover` does."""
-    from beamline.scan.resume import recover_run
-
-    recovered, left_out = recover_run(run)
-    for warning in left_out:
-        click.echo(f"Warning: {warning}", err=True)
-    for done in recovered:
-        json_sink(Done(done, time=SystemClock().now()))
-        if not as_json:
-            click.echo(done.in_words())
 
 
 def faults_of(result: RunResult) -> list[str]:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE, NameChoice, WholeRange, option, parsed, together
+from beamline.cli.recipe import CORRECTIONS, DATA, heading
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
 from beamline.projections.step import Option, options_of
@@ -103,7 +103,7 @@ light_options = together(
 
 
 def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:
-    """None if nobody asked for the light. Raises UsageError for a dose without photons."""
+    """The light options; None without --photons-per-count. UsageError for a dose without photons."""
     if photons_per_count is None:
         if dose_in is not None:
             raise click.UsageError("--dose-in goes with --photons-per-count.")
@@ -114,7 +114,7 @@ def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAs
 
 
 def span(value: str) -> tuple[int, int]:
-    """`first:end`, whole numbers. ValueError for anything else."""
+    """Parse FIRST:END, two whole numbers. ValueError for anything else."""
     match = re.fullmatch(r"(\d+):(\d+)", value)
     if match is None or int(match[1]) >= int(match[2]):
         raise ValueError(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
@@ -122,7 +122,7 @@ def span(value: str) -> tuple[int, int]:
 
 
 def column(value: str) -> float | None:
-    """A column of the detector; None for "auto". ValueError for anything else."""
+    """Parse a column of the detector; "auto" gives None. ValueError for anything else."""
     if value == "auto":
         return None
     if value.startswith("try:"):
@@ -137,7 +137,7 @@ def column(value: str) -> float | None:
 
 
 def distances(value: str) -> tuple[float, float]:
-    """`sod:sdd` in mm. ValueError for anything else."""
+    """Parse SOD:SDD in mm. ValueError for anything else."""
     try:
         sod, sdd = (float(part) for part in value.split(":"))
     except ValueError:
@@ -149,11 +149,12 @@ def distances(value: str) -> tuple[float, float]:
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of `Selection`, from --views on, with those of every step, and what `scan_options` adds."""
-    return together(*_BEFORE, scan_options, *_AFTER, *map(_of_step, _step_options()))(command)
+    of_steps = (_of_step(option) for step in registered() for option in options_of(step).values())
+    return together(*_BEFORE, scan_options, *_AFTER, *of_steps)(command)
 
 
 def chosen(file: Path, seed: int, values: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
-    """The scan, and the part of it that the values of a command's parameters name."""
+    """Source and selection that the parameter values of a command describe."""
     from beamline.projections.selection import Selection
     from beamline.storage.readers.open import SourceOptions
 
@@ -178,11 +179,6 @@ def chosen_steps(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
         return steps_of(values)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
-
-
-def _step_options() -> list[Option]:
-    """The options of all steps, in the order of the registry."""
-    return [option for step in registered() for option in options_of(step).values()]
 
 
 def _of_step(asked: Option) -> Callable[..., Any]:

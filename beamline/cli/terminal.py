@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Self, TextIO
 
 from rich.console import Console
@@ -26,11 +28,13 @@ from beamline.core.events import (
     KernelsCompiled,
     PhaseReached,
     RunDone,
+    RunStarted,
     Sink,
     TrialReached,
     VolumeDone,
 )
 from beamline.core.machine_speed import seconds_left
+from beamline.core.process import ChildProcess
 from beamline.core.sinks import sentence
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
@@ -43,11 +47,12 @@ from recon.methods import BASELINE
 if TYPE_CHECKING:
     from beamline.storage.recon_record import ReconRecord
 
+
 LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
 SAY_EVERY = 0.2  # s between events on the progress of many frames
 PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
 _COUNTED = {
-    **dict.fromkeys(("ingest", "xafs", "monitor", "correction", "validate"), ("frames", "frames")),
+    **dict.fromkeys(("ingest", "xafs", "monitor", "validate"), ("frames", "frames")),
     "archive": ("written and compared", "MB"),
 }  # stage: the name of its bar and what it counts; other stages are named after what they count
 
@@ -271,3 +276,42 @@ def results(record: ReconRecord) -> str:
 def _clock_time(seconds: float) -> str:
     whole_seconds = round(seconds)
     return f"{whole_seconds // 3600}:{whole_seconds // 60 % 60:02}:{whole_seconds % 60:02}"
+
+
+LOOK, ACT = "watch", "control"  # Purpose of an address: the first word of its line
+ENDS_WITHIN = 3.0  # s
+
+
+class PageBeside:
+    """A sink that serves the page of a run from a process of its own, as long as the context lasts.
+
+    Args:
+        say: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._held = say, ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.close()
+
+    def __call__(self, event: Event) -> None:
+        if not isinstance(event, RunStarted):
+            return
+        page = ["watch", str(event.folder), "--control", "--until-stdin-ends"]
+        command = [sys.executable, "-m", "beamline.cli.main", *page]
+        try:
+            nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
+            child = ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True)
+            self._held.callback(child.wait, seconds=ENDS_WITHIN)
+            self._held.callback(child.let_go)  # first: open pages are told that they end
+        except OSError as error:
+            self._say(f"There is no page ({error}). The scan is not affected.")
+
+    def _pass_on(self, line: str) -> None:
+        what, _, address = line.strip().partition(" ")
+        if what in (LOOK, ACT):
+            self._say(f"Page, to {what}: {address.strip()}")

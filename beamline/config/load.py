@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from beamline.config.devices import DcamOrca
-from beamline.config.errors import declared_at, explain
 from beamline.config.models import Config as Config
 from beamline.config.models import (
     Fields,
@@ -27,12 +26,12 @@ from beamline.config.models import (
     SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
-from beamline.config.tree import Tree, override, read
+from beamline.config.tree import Tree, declared_at, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.shipped import config_folder as config_folder
 from beamline.core.shipped import version
-from beamline.plan import angles
+from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 
@@ -207,25 +206,27 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     try:
         text = text_in(path, SETTINGS)
     except OSError as error:
-        raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
+        raise ConfigError(
+            f"simulation.scene: {path} cannot be read ({error.strerror or error}). Nothing was started."
+        ) from None
     return read(text, str(path)).data
 
 
 def _angles(plan: Any) -> NDArray[np.float64]:
     match plan:
         case SectorAngles():
-            return angles.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
+            return plans.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
         case FileAngles():
-            return angles.from_text(text_in(Path(plan.path)))
+            return plans.from_text(text_in(Path(plan.path)))
     start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
     match plan:
         case RandomAngles():
-            return angles.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
+            return plans.random(plan.views, start, span, rng=np.random.default_rng(plan.seed))
         case InterlacedAngles():
-            return angles.interlaced(plan.views, plan.passes, start, span)
+            return plans.interlaced(plan.views, plan.passes, start, span)
         case GoldenAngles():
-            return angles.golden(plan.views, start, span)
-    return angles.fixed(plan.views, start, span)
+            return plans.golden(plan.views, start, span)
+    return plans.fixed(plan.views, start, span)
 
 
 def _field(fields: Fields, exposure: float) -> FieldPlan:

@@ -1,4 +1,4 @@
-"""Plausible: values that a unit mistaken by a factor makes, which every type accepts and no instrument has."""
+"""Plausible ranges: values in a mistaken unit, such as eV for keV, which every type accepts and no instrument has."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _SAME = 1e-3  # share by which an angle may be off half a turn or a turn in radi
 
 @dataclass(frozen=True)
 class PlausibleRange:
-    """Values that instruments have.
+    """The range of values that instruments have.
 
     Attributes:
-        others: units that are mistaken for this one, with what a number of them is in this one.
+        others: units that are mistaken for this one, each with its factor to this one.
     """
 
     low: float
@@ -37,7 +37,7 @@ the longest hutches, and the longest exposures that a ring lasts."""
 
 
 def doubt(name: str, value: float | None) -> str:
-    """A sentence on a value beyond any instrument, by its name in RANGES, with what may be meant; empty: it may be."""
+    """A sentence on a value that no instrument has, with the unit that may be meant; empty for a plausible value."""
     known = RANGES[name]
     if value is None or known.low <= value <= known.high or not value > 0:
         return ""
@@ -54,7 +54,7 @@ def doubt(name: str, value: float | None) -> str:
 
 
 def doubt_span(span_deg: float | None) -> str:
-    """A sentence on a span of angles that is half a turn or a turn in radians; empty: it is not."""
+    """A sentence on a span that looks like radians (half a turn or a turn); empty for any other span."""
     for turn in (math.pi, 2 * math.pi):
         if span_deg is not None and abs(abs(span_deg) / turn - 1) < _SAME:
             return (

@@ -25,7 +25,7 @@ class RunResult:
         bytes: size of the file that was written.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
         status: `complete`, `stopped` or `failed`.
-        returned: views on the way back, with the motion of the sample (`beamline.projections.returned.ReturnedView`).
+        returned: views on the way back, with the motion of the sample (`projections.flagged_frames.ReturnedView`).
         sample: its name.
     """
 

@@ -110,11 +110,11 @@ Warn = Callable[[str], None]  # Takes a sentence about something that is wrong t
 
 
 class Note(str):
-    """A sentence about what was done: nothing is wrong. Who takes warnings tells it as a state."""
+    """A sentence about what was done, with nothing wrong: it becomes an event `state`, not a warning."""
 
 
 def event_of_sentence(text: str, now: float) -> Event:
-    """A warning; of a note a state."""
+    """The event of a sentence: a warning, or a state for a `Note`."""
     return StateEntered("note", text, time=now) if isinstance(text, Note) else Warned(text, time=now)
 
 

@@ -44,7 +44,7 @@ class Spectra:
     attenuation: NDArray[np.float64]
 
     def at(self, energy_kev: float) -> NDArray[np.float64]:
-        """[material], between the energies of the table. ConfigError outside of them."""
+        """Attenuation [material] in 1/mm, interpolated in energy. ConfigError outside the table."""
         if not self.energies[0] <= energy_kev <= self.energies[-1]:
             raise ConfigError(
                 f"{self.path} has energies from {self.energies[0]:g} to {self.energies[-1]:g} keV; a scan was made at "
@@ -62,7 +62,8 @@ def read_spectra(path: Path) -> Spectra:
     try:
         lines = [line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip()]
     except (OSError, csv.Error) as error:
-        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+        said = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{path} is no table of spectra ({said}). Expected {_TABLE}.") from error
     head, *rest = lines or [[]]
     names = tuple(name.strip() for name in head[1:])
     if not rest or not names or head[0].strip() != "energy_kev":
@@ -107,7 +108,7 @@ class EnergyScans:
 
     @property
     def path(self) -> Path | str:
-        """Of the first scan."""
+        """Path of the first scan."""
         return self.scans[0].path
 
     def open(self, *, follow: bool = False) -> ScanSource:
@@ -179,7 +180,7 @@ def prepare_energies(
 
 
 def attenuation_of(scans: EnergyScans, selection: Selection) -> NDArray[np.float64]:
-    """[energy, material], 1/mm at the energy of each scan; no frame is read.
+    """Attenuation [energy, material] in 1/mm at the energy of each scan; no frame is read.
 
     Raises:
         ConfigError: energies that are missing, not in the table, or do not tell the materials apart.

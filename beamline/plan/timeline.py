@@ -1,4 +1,10 @@
-"""Timeline: a plan computed for one stage and one camera, as values and as lines for the operator."""
+"""Timeline: a plan computed for one stage and one camera, as values and as lines for the operator.
+
+Darks then flats come before the views; views on the way back, flats, then darks after them. A fly scan turns at step /
+period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
+to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return at
+full speed between them.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +18,19 @@ from numpy.typing import NDArray
 
 from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
-from beamline.plan.angles import Retake, retake_block, return_block, spread_retakes
-from beamline.plan.limits import PlanFacts, remarks, violations
-from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.triggers import Flight, Scale, plan_flight
+from beamline.plan.limits import Flight, PlanFacts, Scale, plan_flight, remarks, violations
+from beamline.plan.plan import (
+    Block,
+    FieldPlan,
+    Mode,
+    Place,
+    Retake,
+    ScanPlan,
+    Timeline,
+    retake_block,
+    return_block,
+    spread_retakes,
+)
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
 
@@ -34,11 +49,8 @@ def work_out(
 ) -> Timeline:
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
 
-    Darks then flats before the views; views on the way back, flats, then darks after them. A fly scan turns at step /
-    period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first
-    pulse to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a
-    return at full speed between them. The duration is that of a stage that stands at its zero and goes back there at
-    the end, without shutter and sample moves.
+    The duration is that of a stage that stands at its zero and goes back there at the end, without shutter and sample
+    moves.
 
     Args:
         to_counts: the stage's conversion of radians to whole counts.

@@ -1,4 +1,4 @@
-"""Consistency: laws that hold for all views of a sample at rest, and what the views leave of them."""
+"""Consistency: laws that hold for all views of a sample at rest, and the warning of one wider than the field."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
+from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.refusals import refuse
 from beamline.projections.selection import Selection, unbinned
-from beamline.projections.truncation import cut_sides
+from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
@@ -26,6 +26,7 @@ from recon.base.units import look_negative
 from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.view_weights import covers_the_circle
 
 _VIEWS = 180  # more do not sharpen the moments, they only cost reading
@@ -94,10 +95,10 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     if not whole or few or not known:
         return {}
     some = spread(np.arange(len(data)), _VIEWS)
-    if cut_sides(data, geometry) or _air_is_off(data, some):
+    if FieldEdges.of(data, geometry).beyond() or _air_is_off(data, some):
         frames = prepared.projections.view_ids[some]
         laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames)]
-        return _told(laws, warn)
+        return _reported(laws, warn)
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
     shown = moments_of((data[view] for view in some), angles, geometry.axis_col)
     of_mass, of_centre = _noise_of(prepared, [data[view] for view in some[:: max(1, some.size // _COLUMN_VIEWS)]])
@@ -109,10 +110,10 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
         laws += [_angles(shown, geometry.angles)] if near else []
         laws += [_turned(shown, frames)] if near and not laws[-1].broken else []
         laws += [_axis(shown, geometry.axis_col, selection)]
-    return _told(laws, warn)
+    return _reported(laws, warn)
 
 
-def _told(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
+def _reported(laws: Sequence[Law], warn: Warn) -> dict[str, str]:
     for law in laws:
         if law.broken:
             warn(law.sentence)
@@ -315,3 +316,12 @@ def _axis(shown: ViewMoments, used: float, selection: Selection) -> Law:
     )
     off = abs(shown.axis_col - used) if selection.axis_col is not None else np.nan
     return Law("axis of the centres of mass", off, max(_AXES_AGREE, _SURE * shown.axis_sigma), "columns", sentence)
+
+
+def cut_sentence(sides: dict[str, float]) -> str:
+    """The warning of a sample that goes on beyond the field, by `FieldEdges.beyond`."""
+    return (
+        f"{beyond_the_field(sides)} What lies outside is not seen by all views: values inside are relative, not "
+        "absolute, and those at the rim are uncertain. FBP continues the views smoothly beyond the edge; the edge "
+        "columns are not used as air. If they are air, and the beam is weaker than its flats, give --air columns."
+    )

@@ -16,9 +16,8 @@ from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
-from beamline.projections.filters import ViewFilters
 from beamline.projections.open_beam import OpenBeam, count_references
-from beamline.projections.read import read_binned, reading_memory, tell_damaged
+from beamline.projections.read import ViewFilters, read_binned, reading_memory, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
@@ -68,7 +67,7 @@ class ScanCorrection:
             raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
         elif selection.step(Preparation).by_current:
             current_scale(source)  # refuses a file without any
-        self._told: set[int] = set()  # views without light that were named
+        self._named_unlit: set[int] = set()  # views without light that were named
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
@@ -267,10 +266,10 @@ class ScanCorrection:
     def _tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
         """Name the views without light among those asked for, once, and the gap that they leave."""
         unlit = np.array([row for row in asked.tolist() if self._light.known.get(row) is False], np.int64)
-        if (news := np.setdiff1d(unlit, sorted(self._told))).size == 0:
+        if (news := np.setdiff1d(unlit, sorted(self._named_unlit))).size == 0:
             return
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
-        self._told.update(news.tolist())
+        self._named_unlit.update(news.tolist())
         self._warn(
             f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "
             f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."

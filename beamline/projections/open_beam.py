@@ -13,8 +13,8 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
     flats_sentence,
+    light_scale,
     read_references,
-    view_scale,
     warn_of_parts_without_flats,
     with_dynamic_flats,
 )
@@ -22,6 +22,7 @@ from beamline.projections.read import read_binned, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.exposures import views_differ
 from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
@@ -71,7 +72,8 @@ class OpenBeam:
             DataError: references that cannot be used.
         """
         asked = selection.step(Preparation)
-        light, n = view_scale(source, asked.by_current), count_references(source)
+        alike = not (asked.by_current or views_differ(source))
+        light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
         used = groups_taken(source) if asked.accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
         if asked.flat_fields == "dynamic":

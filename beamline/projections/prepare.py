@@ -15,20 +15,18 @@ from beamline.core.phases import Phases
 from beamline.core.plausible import RANGES, doubt
 from beamline.core.sinks import Note, Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
+from beamline.projections.consistency import compare_with_flats, cut_sentence, warn_of_inconsistency
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated, stated_poses
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanStep
-from beamline.projections.refusals import checked_views
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
-from beamline.projections.truncation import cut_sentence, cut_sides
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.view_geometry import ViewGeometry
+from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -39,6 +37,7 @@ from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.field_edges import FieldEdges
 from recon.voxels.projector import seen_rays
 
 _SAME_AXIS = 0.05  # columns
@@ -53,12 +52,10 @@ class DiskBuffer:
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
         batch: views that are corrected at a time.
-        progress: how many of how many frames were read.
     """
 
     views: NDArray[np.float32]
     batch: int
-    progress: Callable[[int, int], None]
 
 
 def _warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
@@ -102,7 +99,6 @@ def prepare_projections(
         views = import_module(in_folders("beamline.features", "VIEWS")["emission"])
         emitted: PreparedProjections = views.prepare_emission(source, emission, selection, warn)
         return emitted
-    _warn_of_joined_views(source, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
     usable, poses = _usable(source, selection, warn)
@@ -166,6 +162,7 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 
 def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None]:
     """The views that may be used and their stated poses; refuses what is wrong before any frame is read."""
+    _warn_of_joined_views(source, warn)
     usable = checked_views(source, selection, warn)
     _warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
@@ -212,7 +209,7 @@ def _corrected(
     if buffer is None:
         projections = correction.at_once(used, progress=phases.progress)
     else:
-        projections = correction.in_batches(used, buffer.views, buffer.batch, buffer.progress)
+        projections = correction.in_batches(used, buffer.views, buffer.batch, phases.progress)
     if 2 * projections.view_ids.size < used.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
@@ -286,7 +283,7 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
-    if sides := cut_sides(projections.data, geometry):
+    if sides := FieldEdges.of(projections.data, geometry).beyond():
         warn(cut_sentence(sides))
         if (change := uncorrected_current(source, selection)) and not any(projections.air_columns):
             warn(change)
@@ -301,8 +298,7 @@ def assemble(
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
     unknown = areas(unknown)
-    regions = replace(usable.regions, resampling=resampling)
-    binning = selection.binning
+    regions, binning = replace(usable.regions, resampling=resampling), selection.binning
 
     def shares_of(views: slice, part: slice) -> NDArray[np.float32] | None:
         within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)

@@ -232,7 +232,6 @@ def hold_out(
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
-    # Neither the first nor the last: they have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     return with_views_held_out(prepared, held)
 

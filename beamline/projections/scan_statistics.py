@@ -53,7 +53,7 @@ def statistics_of(
     progress: Callable[[int, int], None],
     kinds: Sequence[FrameKind] = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION),
 ) -> list[KindStatistics]:
-    """Of these kinds, as far as there are any. `progress`: frames read, of how many."""
+    """Statistics of the frames of these kinds, as far as the scan has any. `progress`: frames read, of how many."""
     chosen = {}
     for kind in kinds:
         rows = np.flatnonzero(source.image_key == kind)
@@ -114,7 +114,7 @@ def _of_kind(
 
 @dataclass(frozen=True)
 class LightAsked:
-    """What the user knows of the light.
+    """What the user states of the light: photons for a count, and the material of a dose.
 
     Attributes:
         photons_per_count: X-ray photons at the sample that make one count.
@@ -189,7 +189,7 @@ def dose_scale(light: Light | None) -> tuple[float, str]:
 
 
 def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightAsked) -> Light:
-    """From the flats and darks among the statistics `found`.
+    """Light and dose of a view, from the statistics of flats and darks.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`.
@@ -211,7 +211,7 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
 
 
 def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
-    """Reads darks and flats; None if nobody asked.
+    """Light and dose of a view, from darks and flats that are read; None if nobody asked.
 
     Raises:
         ConfigError: as `LightAsked.refuse_impossible`, before any frame is read.
@@ -223,7 +223,7 @@ def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
 
 
 def table(statistics: list[KindStatistics]) -> list[tuple[str, ...]]:
-    """Head, and a row for each kind."""
+    """The statistics as a table of texts: a head, and a row for each kind."""
     percent = tuple(f"{p:g} %" for p in PERCENT)
     head = ("kind", "frames", "min", *percent, "max", "mean", "std", "saturated", "not finite")
     rows = [

@@ -158,7 +158,7 @@ def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | N
 
 
 def pixel_size(source: ScanSource, selection: Selection) -> float | None:
-    """In mm, that of the selection or of the file; None where neither says it.
+    """Pixel size in mm, from the selection or the file; None where neither states it.
 
     Raises:
         ConfigError: no detector has such pixels.

@@ -102,6 +102,6 @@ class StepMemory:
 
     @classmethod
     def of_all(cls, steps: Iterable[StepMemory]) -> StepMemory:
-        """That of all steps, which act one after the other."""
+        """Memory of all steps, which act one after the other."""
         needs = list(steps)
         return cls(max(need.correcting for need in needs), max(need.alone for need in needs))

@@ -92,7 +92,7 @@ class UsableViews:
     jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def only(self, frames: NDArray[np.int64]) -> UsableViews:
-        """The same without the frames that are not among these."""
+        """The usable views restricted to these frames."""
         return replace(self, frames=frames, left_out=self.left_out + self.frames.size - frames.size)
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
@@ -113,7 +113,7 @@ views are missing."""
 
 
 def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
-    """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike.
+    """Projections without an alarm and their weights; all with equal weights if `use_flags` is False.
 
     Args:
         judged: flags that count in place of the file's.

@@ -57,7 +57,7 @@ class _Budget:
         return plans(available, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
     def preferred(self, choices: Sequence[Choice]) -> Choice:
-        """The first of the methods that is level with the most promising one."""
+        """The most preferred method whose expected gain is level with the largest."""
         level = [c for c in choices if c.gain >= choices[0].gain - _LEVEL]
         order = list(self.methods)
         return min(level, key=lambda c: order.index(c.method))

@@ -25,7 +25,7 @@ _SHOWN = 40  # most characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
-    """All that determines a step or a slab: data (by a checksum), geometry and settings.
+    """Origin of a fit or a slab: checksum of the data, geometry and settings.
 
     Args:
         prepared: line integrals and geometry; views held out do not matter.
@@ -51,11 +51,11 @@ def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[s
         if current is None or stored is None:
             out.append(f"{name} is known of one of them only")
         elif not np.array_equal(np.asarray(current), np.asarray(stored)):
-            out.append(f"{name.removeprefix('setting ')} {_told(current, stored)}")
+            out.append(f"{name.removeprefix('setting ')} {_difference(current, stored)}")
     return out
 
 
-def _told(current: Value, stored: Value) -> str:
+def _difference(current: Value, stored: Value) -> str:
     a, b = np.asarray(current), np.asarray(stored)
     if a.shape != b.shape:
         return f"({a.size} values, {b.size} in the file)"
@@ -89,7 +89,7 @@ class CheckpointOptions:
         The checkpoint may replace the one that the fit resumes from.
         """
         if self.resume is not None:
-            _whole(self.resume)
+            _read_state(self.resume)
         if self.path is not None and not (self.resume is not None and self.path.resolve() == self.resume.resolve()):
             refuse_existing(self.path)
 
@@ -107,7 +107,7 @@ class CheckpointOptions:
         """
         if self.resume is None:
             return None
-        kept, reached = _whole(self.resume)
+        kept, reached = _read_state(self.resume)
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
@@ -132,7 +132,7 @@ class CheckpointOptions:
         return ""
 
 
-def _whole(path: Path) -> tuple[Checkpoint, FitState]:
+def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
     """The checkpoint, and the state in it.
 
     Raises:

@@ -19,7 +19,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
-from beamline.projections.view_geometry import with_rays
+from beamline.projections.views import with_rays
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
@@ -31,7 +31,7 @@ from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
 
 class FollowState(Enum):
-    """What the fit of a growing scan waits for, or does."""
+    """State of the fit of a growing scan."""
 
     WAITS_FOR_REFERENCES = auto()
     WAITS_FOR_AXIS = auto()
@@ -41,7 +41,7 @@ class FollowState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Cursor:
-    """How far the fit has come in the file.
+    """Progress of the fit in a growing file.
 
     Attributes:
         frames: in the file at the last look.
@@ -114,7 +114,7 @@ _FIRST_VIEWS = 12  # fewer views do not determine an axis
 
 
 class AxisSearch:
-    """Looks for the axis each time the views have grown by half, and once more when all are there.
+    """Searches the rotation axis each time the views have grown by half, and once more at the end.
 
     Attributes:
         col: the axis in pixels of the file; None while it is unknown.
@@ -144,8 +144,8 @@ class AxisSearch:
         self._next, self.settled = views.size + views.size // 2, ended
         last_chance = ended and self.col is None
         try:
-            told = self._warn if last_chance else _quiet
-            axis_col, estimate = locate_axis(self._source, correction, views, told, all_there=last_chance)
+            warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
+            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
         except DataError:
             if last_chance:
                 raise
@@ -154,16 +154,8 @@ class AxisSearch:
             self.col, self.estimate = axis_col, estimate
 
 
-def _quiet(text: str) -> None:
-    """Hides warnings on an axis that will be searched again."""
-
-
 GROWTH = 1.25  # growth of the views between predictions
 _FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
-
-
-class NotPlannedError(Exception):
-    """The further views are unknown; the message says why."""
 
 
 def planned_views(
@@ -175,15 +167,15 @@ def planned_views(
         taken: frames of the views so far, in batches.
 
     Raises:
-        NotPlannedError: the beam is a cone, or the file says no plan.
+        ValueError: the beam is a cone, or the file says no plan.
     """
     if cone_of(source, selection) is not None:
-        raise NotPlannedError("its beam is a cone")
+        raise ValueError("its beam is a cone")
     if source.part_starts.size > 1:
-        raise NotPlannedError("it goes on with a run that ended early, so that views come out of their order")
+        raise ValueError("it goes on with a run that ended early, so that views come out of their order")
     angles = source.plan.get("angles_deg")
     if angles is None or axis_col is None:
-        raise NotPlannedError("its file does not say which views are planned")
+        raise ValueError("its file does not say which views are planned")
     places = parse_views(selection.views, np.zeros(len(angles)))
     last = max(int(ids[-1]) for ids in taken)
     n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
@@ -193,7 +185,7 @@ def planned_views(
 
 
 class EnoughViews:
-    """Looks at the views each time they have grown by a quarter.
+    """Predicts the gain of further views each time the views have grown by a quarter.
 
     A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
     which errs on the side of more views.
@@ -246,7 +238,7 @@ def report_gain(
     """
     try:
         planned = planned_views(views.source, views.selection, axis_col, taken)
-    except NotPlannedError as error:
+    except ValueError as error:
         warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
         return False
     gain = enough.look(data, planned)

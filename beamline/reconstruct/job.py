@@ -19,13 +19,12 @@ from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
-from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by
+from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ScanFacts
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import run_on
+from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
-from beamline.reconstruct.workers import cluster
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
 from recon.base.geometry import Geometry
@@ -176,7 +175,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
 def runner_of(
     options: ReconOptions, reconstruct: Callable[..., Reconstruction] = recon.reconstruct
 ) -> Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]:
-    """`run_on` with the seed and the device of the options; what a method refuses names the file."""
+    """`run_on` with seed and device of the options; errors of the method name the scan file."""
 
     def run(method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
         with refused(options, f" by {method.name}"):
@@ -186,7 +185,7 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct by the options: within a budget, in slabs, or at once. Then the views as the volume used them."""
+    """Reconstruct within a budget, in slabs, or at once; returns the volume, and the views as it used them."""
     prepared = job.prepared
     if job.options.budget is not None:
         return _within_budget(job, job.options.budget)

@@ -10,8 +10,8 @@ from beamline.core.sinks import Note, event_of_sentence
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import contrast_by, measure, regions, residual_share, uniform_residual
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext
-from beamline.reconstruct.remarks import (
+from beamline.reconstruct.outcome import (
+    ReportContext,
     hiding_warning,
     lost_mass_warning,
     needles_warning,
@@ -60,12 +60,13 @@ def judge(
     judged.compare_regions()
     judged.compare_air()
     judged.decide_whether_fbp_is_kept(in_parts)
-    judged.tell_what_was_left_out()
+    if judged.left_out_text:
+        sink(StateEntered("left_out", judged.left_out_text, time=clock.now()))
     return judged
 
 
 class VolumeLooks:
-    """The looks at one volume, in their order, and what they showed; arguments as of `judge`.
+    """Checks of one volume, in their order, and their results; arguments as of `judge`.
 
     Attributes:
         volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
@@ -100,7 +101,7 @@ class VolumeLooks:
 
     @property
     def waited_for(self) -> bool:
-        """Somebody stopped the reconstruction, and waits."""
+        """Whether the reconstruction was stopped, so that the user waits for its end."""
         return self.made.ending.early
 
     @property
@@ -108,23 +109,18 @@ class VolumeLooks:
         return by_name(self.made.method).traits.direct
 
     def has_time_for(self, projections: float) -> bool:
-        """Whether there is time for so many times the projection of all views."""
+        """Whether there is time for `projections` projections of all views."""
         return not self.waited_for and self.context.leaves(projections * self.all_rays)
 
     def warn(self, sentence: str) -> None:
-        """Tell of a warning that is not empty, and keep it."""
+        """Send and keep a warning; an empty one is ignored."""
         if sentence:
             self.sink(event_of_sentence(sentence, self.clock.now()))
             self.warnings.append(sentence)
 
     @property
-    def stray_map(self) -> NDArray[np.float32] | None:
-        """The map of mass where views show nothing [y, x]; None without any."""
-        return self.stray.map if self.stray is not None and self.stray.share > 0 else None
-
-    @property
     def left_out_text(self) -> str:
-        """The looks left out, and why; empty without any."""
+        """A sentence on the checks left out, and why; empty without any."""
         if not self.left_out:
             return ""
         why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"
@@ -240,10 +236,6 @@ class VolumeLooks:
             "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
             "disk. Make it with --method fbp to lost_matter."
         )
-
-    def tell_what_was_left_out(self) -> None:
-        if self.left_out_text:
-            self.sink(StateEntered("left_out", self.left_out_text, time=self.clock.now()))
 
 
 def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_] | None:

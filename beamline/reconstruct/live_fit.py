@@ -25,11 +25,11 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
-from beamline.projections.refusals import checked_views, correction_blockers, refuse
 from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
+from beamline.projections.views import checked_views, correction_blockers, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, EnoughViews, FollowedViews, FollowState, report_gain
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions

@@ -1,11 +1,13 @@
-"""The memory of a reconstruction, at once and in slabs, and what is refused because of it."""
+"""The memory of a reconstruction, at once and in slabs, what is refused because of it, and workers elsewhere."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
@@ -15,12 +17,12 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.step import StepMemory
-from beamline.projections.view_geometry import stated_geometry
+from beamline.projections.views import stated_geometry
 from beamline.reconstruct.options import ReconOptions, views_of_others, with_as_many_views
-from beamline.reconstruct.workers import cluster
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
+from recon.base.registry import in_folders
 from recon.base.volume import Grid, Slab
 from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
@@ -243,3 +245,15 @@ def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: ReconMemory, memory: 
             f"The slabs of {path} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
             f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
         )
+
+
+def cluster() -> Any:
+    """The module of the feature: `check_cluster`, `refuse_unusable`, `memory_of_each` and `connected` take its spec.
+
+    Raises:
+        ConfigError: this installation has none.
+    """
+    modules = in_folders("beamline.features", "WORKERS")
+    if "cluster" not in modules:
+        raise ConfigError("--cluster: this installation has no workers. Leave it out. Nothing was started.")
+    return import_module(modules["cluster"])

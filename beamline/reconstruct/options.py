@@ -20,7 +20,7 @@ from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.view_geometry import stated_geometry
+from beamline.projections.views import stated_geometry
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.option_rules import RULES, contradiction, of_other_methods
 from beamline.reconstruct.region import AroundSample, Region, selection_around
@@ -35,7 +35,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import EarlyStopMethod, Method, PresetMethod
 from recon.base.volume import Grid
 from recon.methods import has_setting, names, streams
-from recon.splatting.fit_method import StreamingMethod
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.enough_views import Goal
@@ -52,7 +52,7 @@ class SeveralScans(Protocol):
 
     @property
     def path(self) -> Path | str:
-        """Of the first scan."""
+        """Path of the first scan."""
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The first scan."""
@@ -307,13 +307,13 @@ class ReconOptions:
         return isinstance(self.method, EarlyStopMethod) and self.method.early_stop
 
     @property
-    def streaming(self) -> StreamingMethod:
+    def streaming(self) -> FitMethod:
         """The method for a followed scan.
 
         Raises:
             ConfigError: it needs the whole scan.
         """
-        if not isinstance(self.method, StreamingMethod):
+        if not isinstance(self.method, FitMethod):
             raise ConfigError(
                 f"--follow needs a method whose volume grows with the views ({', '.join(filter(streams, names()))}); "
                 f"run {self.method.name} without --follow when the scan has ended."

@@ -1,4 +1,4 @@
-"""The facts of a scan, and the context of its reconstruction, that a report and a file state."""
+"""What a report and a file state of a scan and its volume: facts, context, and warnings of faults of the volume."""
 
 from __future__ import annotations
 
@@ -11,20 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.phases import Phases
-from beamline.core.text import spans
-from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
-from beamline.projections.returned import returned_views
+from beamline.core.text import count, spans
+from beamline.projections.flagged_frames import reasons, reference_images, returned_views, worst_frames
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.scan import scan_ended
 from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
+from recon.base.volume import Grid
 from recon.methods import by_name
+from recon.splatting.gaussians import NEEDLES_LIMIT, needles
+from recon.voxels import odd_views, view_weights
 from recon.voxels.fbp import Filter
+from recon.voxels.matter_checks import STRAY_LIMIT, UNEXPLAINED_LIMIT, LostMatter, StrayMass, Unexplained
 
 if TYPE_CHECKING:
-    from beamline.report.contact_sheet import FlaggedFrame
+    from beamline.report.sheets import FlaggedFrame
 
 
 @dataclass(frozen=True)
@@ -148,3 +154,140 @@ def as_text(value: object) -> str:
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     return f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+
+
+_NAMED = 5  # odd views, at most
+
+
+def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
+    """Slices that views at heights of their own see over less of the half turn than others."""
+    if geometry.is_cone or not geometry.is_straight or not geometry.shifts[:, 1].any():
+        return np.zeros(0, np.intp)
+    heights = Grid.matching(geometry).coordinates()[0]
+    return np.flatnonzero(view_weights.partly_seen(geometry, heights / geometry.pixel_pitch + geometry.axis_row))
+
+
+def partly_seen_warning(geometry: Geometry) -> str:
+    """The warning that few views see some slices; empty if all are seen alike."""
+    some = partly_seen(geometry)
+    if not some.size:
+        return ""
+    return (
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen over less of the half turn than "
+        "the others, since views stand at heights of their own: there the volume is streaked, and too thin by FBP."
+    )
+
+
+def lost_mass_warning(made: Reconstruction, beside_fbp: LostMatter) -> str:
+    """The warning that a volume has lost weak matter that FBP shows; empty if it has not."""
+    if beside_fbp.lost is None:
+        return ""
+    z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
+    return (
+        f"The {label_of(made.method)} volume keeps {beside_fbp.kept:.0%} of the mass that FBP shows above its own air "
+        f"in a region of {z},{y},{x} [z, y, x]. Weak matter was lost, as where air is below zero. See --air in "
+        "docs/corrections.md, give --allow-negative, or use --method fbp."
+    )
+
+
+def not_begun_warning(made: Reconstruction, residual: float, uniform: float) -> str:
+    """The warning that a volume shows nothing of the sample yet; empty if it explains its views better than a cylinder.
+
+    Args:
+        residual: of the volume. uniform: that of a cylinder of one density, see `measure.uniform_residual`.
+    """
+    if residual < uniform or by_name(made.method).traits.direct:
+        return ""
+    last = made.history[-1] if made.history else None
+    steps = f" after {last.step} of {last.steps} {last.unit or 'steps'}" if last is not None and last.steps else ""
+    return (
+        f"The {label_of(made.method)} volume shows nothing of the sample: it leaves {residual:.3g} of the views, where "
+        f"a cylinder of one density that fills the field leaves {uniform:.3g}. The method ended in {made.seconds:.3g} "
+        f"s{steps}, before it had begun: give it more seconds, steps or iterations, or use --method fbp."
+    )
+
+
+_COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
+
+
+def hiding_warning(made: Reconstruction, structure: Unexplained) -> str:
+    """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
+    if structure.share <= UNEXPLAINED_LIMIT or by_name(made.method).traits.direct:
+        return ""
+    others = " and ".join(name for name in _COMPARED if name != made.method)
+    return (
+        f"{structure.share:.1%} of the matter leaves structure in the residual of the views (at most "
+        f"{UNEXPLAINED_LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
+        f"at 'What the volume leaves in the views' in the report, and compare with --method {others}."
+    )
+
+
+def _crossing_sentence(parts: tuple[odd_views.OddView, ...], frames: NDArray[np.int64], first: int, side: int) -> str:
+    """Odd views that one object makes on its way through the field."""
+    rows = min(odd.rows[0] for odd in parts), max(odd.rows[1] for odd in parts)
+    speed = odd_views.speed_of(parts) * side
+    return (
+        f"one object that crosses, seen in {count(len(parts), 'view')} of frames {frames[parts[0].view]} ... "
+        f"{frames[parts[-1].view]}, rows {first + rows[0] * side} ... {first + rows[1] * side - 1}, "
+        f"{abs(speed):.1f} px a view to the {'right' if speed > 0 else 'left'} "
+        f"(absorbs {'more' if parts[0].score > 0 else 'less'}; `beamline monitor` shows its whole way)"
+    )
+
+
+def stray_mass_warning(made: Reconstruction, stray: StrayMass) -> str:
+    """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
+    if stray.share <= STRAY_LIMIT or by_name(made.method).traits.direct:
+        return ""
+    return (
+        f"{stray.share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
+        f"(at most {STRAY_LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
+    )
+
+
+def needles_warning(made: Reconstruction, geometry: Geometry) -> str:
+    """The warning that a model is made of needles; empty if it is not, or if there is no model."""
+    if made.gaussians is None or not made.gaussians.n:
+        return ""
+    found = needles(made.gaussians, geometry)
+    if found.share <= NEEDLES_LIMIT:
+        return ""
+    return (
+        f"{found.share:.0%} of the mass of the model is in Gaussians thinner than a pixel and ten times as long (at "
+        f"most {NEEDLES_LIMIT:.0%} is usual). They follow the noise of few views: compare with --method fista-tv."
+    )
+
+
+def odd_views_warning(
+    made: Reconstruction,
+    prepared: PreparedProjections,
+    selection: Selection,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> str:
+    """The warning that parts of views are not in the volume; empty without such parts, and for direct methods.
+
+    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    `progress` hears how many of how many views were compared.
+    """
+    if by_name(made.method).traits.direct or made.ending.early:
+        return ""
+    views = prepared.projections.data
+    found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), progress=progress)
+    if not found:
+        return ""
+    first, side = (selection.rows or (0, 0))[0], selection.binning
+    frames = prepared.projections.view_ids
+    crossing = odd_views.on_a_line(found)
+    places = [_crossing_sentence(crossing, frames, first, side)] if crossing else []
+    places += [
+        f"frame {prepared.projections.view_ids[odd.view]}, rows {first + odd.rows[0] * side} ... "
+        f"{first + odd.rows[1] * side - 1}, columns {odd.cols[0] * side} ... {odd.cols[1] * side - 1} "
+        f"(absorbs {'more' if odd.score > 0 else 'less'})"
+        for odd in sorted((odd for odd in found if odd not in crossing), key=lambda odd: -abs(odd.score))[:_NAMED]
+    ]
+    unnamed = len(found) - len(crossing) - _NAMED
+    more = f"; and {unnamed} more" if unnamed > 0 else ""
+    return (
+        f"{count(len(found), 'view')} with a part that is not in the volume, by more than {odd_views.LIMIT:g} times "
+        f"what is usual there: {'; '.join(places)}{more}. Something was in the beam, or the sample was elsewhere: look "
+        "at these frames."
+    )

@@ -12,19 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Counted, Sink, StateEntered
+from beamline.core.events import Sink, StateEntered
 from beamline.core.machine import Need
-from beamline.core.machine_speed import seconds_left
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
 from beamline.projections.prepare import DiskBuffer, prepare_projections, refuse_spilled
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, cone_of
-from beamline.reconstruct.error_bars import refuse_impossible, refuse_views
 from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.memory import (
     ReconMemory,
+    cluster,
     memory_of,
     recon_memory_of,
     refuse_few_views,
@@ -42,7 +41,7 @@ from beamline.reconstruct.options import (
     with_as_many_views,
 )
 from beamline.reconstruct.region import Region, locate
-from beamline.reconstruct.workers import cluster
+from beamline.reconstruct.run import refuse_impossible, refuse_views
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
@@ -198,13 +197,7 @@ def prepare_within(
     source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
     """As `prepare_projections`, and the plan: of a volume in slabs line integrals lie on disk."""
-    began, selection = clock.now(), options.selection
-
-    def progress(n: int, total: int) -> None:
-        now = clock.now()
-        spent = max(now - began, 1e-9)
-        sink(Counted("correction", n, total, n / spent, seconds_left(n, total, spent) or 0.0, time=now))
-
+    selection = options.selection
     try:
         needs = recon_memory_of(source, options)
     except (ConfigError, DataError):
@@ -220,7 +213,7 @@ def prepare_within(
         sink(StateEntered("memory", sentence, time=clock.now()))
         batch = max(1, int((_BATCH * plan.allowed - needs.steps.correcting) / needs.view))
         shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
-        buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch, progress)
+        buffer = DiskBuffer(scratch_array(options.target.output.parent, shape), batch)
     others = views_of_others(options.source, selection)
 
     def check(geometry: Geometry) -> None:

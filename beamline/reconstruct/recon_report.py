@@ -11,12 +11,17 @@ from numpy.typing import NDArray
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.outcome import ReportContext, ScanFacts, as_text, label_of
 from beamline.report import figures
-from beamline.report.contact_sheet import contact_sheet, reference_sheet
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
-from beamline.report.record import history_arrays, price_of_decibel, price_text, residual_curve, views_grew
-from beamline.report.slice_sheet import SliceSheet
-from beamline.report.time_curves import quality_against_time
+from beamline.report.record import (
+    history_arrays,
+    price_of_decibel,
+    price_text,
+    quality_against_time,
+    residual_curve,
+    views_grew,
+)
+from beamline.report.sheets import SliceSheet, contact_sheet, reference_sheet
 from beamline.storage.recon_record import Value
 from recon.base.method import Reconstruction
 from recon.base.views import spread

@@ -15,12 +15,12 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
-from beamline.projections.truncation import cut_sides
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.voxels.field_edges import FieldEdges
 
 Span = tuple[int, int]
 
@@ -196,9 +196,9 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     grid = Grid.matching(geometry_of(source, selection, prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
-    if cut := cut_sides(data, geometry):
+    if cut := FieldEdges.of(data, geometry).beyond():
         where = " and the ".join(cut)
-        return _whole(height, across, f"the sample goes on beyond the field at the {where}, where it shows no edge")
+        return _uncut(height, across, f"the sample goes on beyond the field at the {where}, where it shows no edge")
     smooth = ndimage.uniform_filter(data, (1, min(3, data.shape[1]), 3))
     least = _least(smooth)
     matter = np.asarray(smooth > least)  # [view, row, col]
@@ -210,7 +210,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
         )
     hull = _hull(matter[:, there], geometry, grid, coarse)
     if not hull.any():
-        return _whole(height, across, "the views do not agree where the sample is")
+        return _uncut(height, across, "the views do not agree where the sample is")
     z = _widened(_extent(there, coarse), height, coarse)
     y, x = (_widened(_extent(np.flatnonzero(hull.any(axis=axis)), coarse), across, coarse) for axis in (1, 0))
     region = Region(z, y, x, requested=False)
@@ -222,7 +222,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     )
 
 
-def _whole(height: int, across: int, why: str) -> Region:
+def _uncut(height: int, across: int, why: str) -> Region:
     reason = f"--roi auto makes the whole volume: {why}."
     return Region((0, height), (0, across), (0, across), requested=False, reason=reason)
 

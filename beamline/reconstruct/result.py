@@ -20,8 +20,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order, recorded
 from beamline.reconstruct.judge import VolumeLooks, judge
 from beamline.reconstruct.options import OutputPaths
-from beamline.reconstruct.outcome import ReportContext, label_of
-from beamline.reconstruct.remarks import partly_seen
+from beamline.reconstruct.outcome import ReportContext, label_of, partly_seen
 from beamline.report.record import history_arrays, price_of_decibel, price_text
 from beamline.storage import hdf5
 from beamline.storage.pose_table import CENTRES_KEPT
@@ -79,7 +78,8 @@ def write_result(
     phases.enter("measuring the volume")
     judged = judge(made, prepared, truth, target, context, sink, clock, partial_volume is not None)
     remarks = [*judged.warnings, *([judged.left_out_text] if judged.left_out_text else [])]
-    context = replace(context, warnings=remarks, stray=judged.stray_map)
+    stray = judged.stray.map if judged.stray is not None and judged.stray.share > 0 else None
+    context = replace(context, warnings=remarks, stray=stray)
     phases.enter("report")
     record, volumes = _record(judged, context, clock.now())
     page, timed = None, _nothing
@@ -105,7 +105,8 @@ def write_result(
     phases.end()
     elapsed = clock.now() - context.started
     timed(elapsed)
-    record = _light(replace(record, elapsed=elapsed, times=phases.seconds), target)  # to replace it reads its voxels
+    record = replace(record, elapsed=elapsed, times=phases.seconds)  # reads the voxels, so that it comes first
+    record = _with_voxels_in_files(record, target)
     sink(VolumeDone(record, time=clock.now()))
     return record
 
@@ -181,7 +182,7 @@ def _in_files(record: ReconRecord, names: Sequence[str]) -> Iterator[ReconRecord
         )
 
 
-def _light(record: ReconRecord, target: OutputPaths) -> ReconRecord:
+def _with_voxels_in_files(record: ReconRecord, target: OutputPaths) -> ReconRecord:
     """A copy of the record whose arrays are read from its files; without files, one with its volumes alone."""
     volume, series = record.volume, record.series
     if target.written:

@@ -91,7 +91,7 @@ def in_slabs(
             job.tell(partial.n_slices_done)
     if control.decide is not None:
         control.decide.made.update(decided)
-    return _whole(partial, job.grid, options, control.now() - job.begin)
+    return _finished(partial, job.grid, options, control.now() - job.begin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +264,7 @@ def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
     }
 
 
-def _whole(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
+def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
     """The result, when all slabs are there."""
     kept = partial.kept
     settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.traits.halo}

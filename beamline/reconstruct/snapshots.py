@@ -19,7 +19,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Sink, SlicesDrawn, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
-from beamline.plan.angles import one_way
+from beamline.plan.plan import one_way
 from beamline.projections.correction import ScanCorrection
 from beamline.reconstruct.followed_views import FollowedViews
 from beamline.reconstruct.options import ReconOptions
@@ -38,6 +38,7 @@ from recon.splatting.anytime import BetterVolume
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from recon.voxels.slices import OrthogonalSlices, orthogonal_slices
+from recon.voxels.view_weights import Wedge, unseen_wedges
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -65,7 +66,7 @@ class Snapshots:
     def write(self, fit: StreamingFit, axis_col: float) -> None:
         """The volume as it stands, and its picture, in place of the last ones."""
         shown = fit.shown()
-        method, errors = self._method(shown)
+        (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
             volume=shown.volume,
             length_unit=self._unit,
@@ -78,7 +79,9 @@ class Snapshots:
                 "n_views": fit.n_views,
                 "method": method,
                 "chosen_because": _why(errors),
-                "unseen_deg": np.degrees(self._unseen or ()),
+                "unseen_deg": np.array(
+                    [] if unseen is None else np.degrees((unseen.first, unseen.first + unseen.size))
+                ),
             },
         )
         try:
@@ -141,8 +144,6 @@ _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a
 _SIGMAS, _MOST = 5.0, 99.0  # least range of the differences, and the percentile that it reaches: shapes stay seen
 _ORANGE = (255, 127, 14)
 _DIAL = 0.08  # radius of the dial of unseen rays, of the side of an image
-Wedge = tuple[float, float]
-"""First and last angle, in radians modulo π, of the views that are still missing; without a wedge None."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,10 +283,10 @@ class _Panel:
     def _dial(self, draw: ImageDraw, right: int, top: int, unseen: Wedge) -> None:
         """Rays in a slice (y downwards) that no view has taken yet, as a double wedge: edges along them are unknown."""
         side = 2 * _DIAL * min(self.pixels.shape)
-        place, (first, last) = (right - side, top, right, top + side), np.degrees(unseen).tolist()
+        place, (first, last) = (right - side, top, right, top + side), unseen.rays
         draw.ellipse(place, outline="#999999")
-        for half in (90, 270):  # a ray of θ runs along -sin θ, cos θ
-            draw.pieslice(place, first + half, last + half, _ORANGE)
+        for turn in (0, 180):  # a ray runs both ways
+            draw.pieslice(place, first + turn, last + turn, _ORANGE)
         draw.text((right - side - 4, top), "rays to come", _ORANGE, _font(11), anchor="ra")
 
 
@@ -309,7 +310,6 @@ def _means(image: F32, step: int) -> F32:
 
 
 _FEWEST, _BEFORE_AXIS = 8, 32  # views; of them, those that are corrected before the axis is known
-_WHOLE = 1.0  # degrees of the half turn that may be missing
 
 
 class LiveSlices:
@@ -338,7 +338,7 @@ class LiveSlices:
             slices = orthogonal_slices([view for part in parts for view in part.data], geometry)
             count = f"{n} of {of}" if of > n else str(n)
             place = "the middle, not known yet" if axis_col is None else f"column {col:.1f}"
-            unseen = unseen_wedge(math.degrees(slices.covered), geometry.angles)
+            unseen = max(unseen_wedges(geometry), key=lambda wedge: wedge.size, default=None)
             heading = f"FBP of {count} views so far{_coverage(unseen, geometry.angles)}, axis at {place}"
             self._snapshots.write_slices(slices, n, heading, unseen)
         end = self._clock.now()
@@ -354,20 +354,9 @@ class LiveSlices:
             self.draw([correction().at_once(spread(views, _BEFORE_AXIS))], None, pause, views.size)
 
 
-def unseen_wedge(covered: float, angles: NDArray[np.float64]) -> Wedge | None:
-    """What views at these angles [view] leave out, where they cover a sector of so many degrees of the half turn."""
-    if covered > 180 - max(_WHOLE, 1.5 * covered / angles.size):
-        return None
-    theta = np.sort(np.mod(angles, np.pi))
-    gaps = np.diff(theta, append=theta[0] + np.pi)
-    widest = int(gaps.argmax())
-    middle, half = theta[widest] + gaps[widest] / 2, math.radians(180 - covered) / 2
-    return float(middle - half), float(middle + half)
-
-
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
     """What a heading says where the views leave a wedge out."""
     if unseen is None:
         return ""
     order = "sequential: " if one_way(angles) else ""
-    return f", {order}{180 - math.degrees(unseen[1] - unseen[0]):.0f} of 180 degrees so far"
+    return f", {order}{180 - math.degrees(unseen.size):.0f} of 180 degrees so far"

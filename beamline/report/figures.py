@@ -102,7 +102,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
 
 
 def planes(grid: Grid) -> list[tuple[str, str, GreyWindow, GreyWindow]]:
-    """Of slices at one z, y and x: the axes to the right and down, and their edges: left and right, bottom and top."""
+    """Axes (right, down) and edges of the slices at one z, y and x: left and right, bottom and top."""
     z, y, x = (_edges(grid.centre[i], grid.shape[i], grid.voxel_size) for i in range(3))
     return [("x", "y", x, y[::-1]), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
 
@@ -395,7 +395,7 @@ def one_panel(height: float, width: float = WIDTH) -> tuple[Figure, Axes]:
 
 
 def canvas(figure: Figure) -> FigureCanvasAgg:
-    """What draws a figure."""
+    """The canvas of a figure."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     return FigureCanvasAgg(figure)

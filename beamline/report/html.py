@@ -79,7 +79,7 @@ def write_timed(path: Path, report: Report, label: str, elapsed: float) -> None:
 
 
 def to_html(report: Report) -> str:
-    """The page as HTML5. A metric that no method has gets no row."""
+    """The report as an HTML5 page. A metric that no method has gets no row."""
     methods = report.metrics.values()
     rows = [
         (metric, [formatted(name, values[name]) if name in values else "–" for values in methods])

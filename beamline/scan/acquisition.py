@@ -12,8 +12,7 @@ from beamline.core.errors import BeamlineError, DataError, InstrumentError, Refe
 from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
-from beamline.plan.angles import middle_of_exposure, retake_block, return_triggers
-from beamline.plan.plan import Block, Timeline
+from beamline.plan.plan import Block, Timeline, middle_of_exposure, retake_block, return_triggers
 from beamline.scan.exposures import ASTRAY_ADVICE, SLICE, TRIES, BlockTally, Exposures
 from beamline.scan.ledger import LedgerError
 from beamline.scan.references import REFERENCES

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 
 from beamline.core.text import count, size
-from beamline.plan.angles import one_way
-from beamline.plan.plan import Mode, ScanPlan
+from beamline.plan.plan import Mode, ScanPlan, one_way
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
 _A_RAY, _A_VOXEL = 40, 50

@@ -41,7 +41,7 @@ Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earli
 
 
 def all_of(plan: ScanPlan) -> ScanPlan:
-    """All of it."""
+    """The whole plan."""
     return plan
 
 

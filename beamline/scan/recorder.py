@@ -30,8 +30,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import Monitor, look_past_failures, rehearse
-from beamline.plan.angles import Retake
-from beamline.plan.plan import Timeline
+from beamline.plan.plan import Retake, Timeline
 from beamline.scan.references import ReferenceLog
 from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
 from drivers.base.frame import Frame, FrameKind

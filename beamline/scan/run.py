@@ -30,8 +30,8 @@ from beamline.core.sinks import Announcer, JsonLines, UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect, enter_pressed
-from beamline.plan.angles import Retake, spread_retakes
-from beamline.projections.returned import ReturnedView, returned_views
+from beamline.plan.plan import Retake, spread_retakes
+from beamline.projections.flagged_frames import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError

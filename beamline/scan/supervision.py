@@ -16,7 +16,7 @@ from beamline.core.events import BeamRead, Sink, Warned
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import count, size
 from beamline.monitor.check import Flag, Level, Policy
-from beamline.plan.angles import Retake
+from beamline.plan.plan import Retake
 from beamline.scan.states import State, StateMachine
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading

@@ -84,7 +84,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
                 file = h5py.File(path, "r", swmr=swmr, locking=locking)
             else:
                 file = opened_whole(path, unlocked=not _being_written(head))
-        except (OSError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             problems.append(error)
             continue
         try:

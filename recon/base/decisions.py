@@ -41,7 +41,7 @@ class Decisions:
 
 
 class Stop:
-    """Request to end work with what it has reached; the work calls it between steps.
+    """A request to end a run with its result so far; the run asks it between steps.
 
     Args:
         asks: True ends the work, and it is not asked again.
@@ -76,5 +76,5 @@ class Stop:
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether somebody's stop left some of the `planned` steps or iterations undone; 0: no number is planned."""
+        """Whether a stop left some of the `planned` steps or iterations undone; 0: no number is planned."""
         return self.stopped and not 0 < planned <= done

@@ -258,15 +258,19 @@ def shown(value: object) -> str:
 
 
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Raise ValueError for an argument of another type than the function declares.
+    """Raise ValueError for an argument of another type than the function declares, or a number beyond its `Bound`.
 
     Args:
         values: by name, such as `locals()` in the function's first line.
     """
-    kinds = types_of(function)
+    declared, bounds = _declared(function)
+    for name, (whole, bound) in bounds.items():
+        value, kind = values.get(name), declared[name]
+        if (is_number(value) or _only_numbers(value, kind)) and not bound.holds(value, whole):
+            raise ValueError(f"{name} must be {bound.words(whole)}, got {shown(value)}")
     for name, value in values.items():
-        if name in kinds and not is_of_type(value, kinds[name]):
-            raise ValueError(refusal(name, value, kinds[name]))
+        if name in declared and not is_of_type(value, declared[name]):
+            raise ValueError(refusal(name, value, declared[name]))
 
 
 class Checked:
@@ -287,20 +291,13 @@ def check_settings(settings: Any) -> None:
         settings: a dataclass.
     """
     owner: Any = type(settings)
-    declared, bounds = _declared(owner)
+    declared = types_of(owner)
     names = [each.name for each in fields(settings) if each.init]
     for name in names:
         value = getattr(settings, name)
         if lone(value) and is_of_type(plain(value), declared.get(name, Any)):
             object.__setattr__(settings, name, plain(value))
-    for name, (whole, bound) in bounds.items():
-        value, kind = getattr(settings, name), declared[name]
-        if (is_number(value) or _only_numbers(value, kind)) and not bound.holds(value, whole):
-            raise ValueError(f"{name} must be {bound.words(whole)}, got {shown(value)}")
-    for name in names:
-        kind = declared.get(name, Any)
-        if not is_of_type(value := getattr(settings, name), kind):
-            raise ValueError(refusal(name, value, kind))
+    check_arguments(owner, {name: getattr(settings, name) for name in names})
 
 
 def _only_numbers(value: Any, kind: Any) -> bool:

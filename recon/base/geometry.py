@@ -366,7 +366,7 @@ class Geometry:
         return replace(self, **lengths, centres=_frozen(factor * self.centres))
 
     def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
-        """The same views, whose rays have a width and whose rows were read one after the other.
+        """The same views with rays of a width, and a skew from row to row (rolling shutter).
 
         Raises:
             ValueError: a skew that is not finite, or of a cone, or of rolled or tilted views: slices of the volume then
@@ -375,7 +375,7 @@ class Geometry:
         return replace(self, width=width, skew=float(skew))
 
     def about(self, centres: ArrayLike) -> Geometry:
-        """The same views of a cone about other points of the object, [view, 3] in mm; see `centres`.
+        """The same views of a cone with other centres, [view, 3] in mm; see `centres`.
 
         Raises:
             ValueError: not finite, another shape, or of a parallel beam.
@@ -429,7 +429,7 @@ class Geometry:
 
 
 def require_views(geometry: Geometry, values: ArrayLike, name: str = "projections") -> None:
-    """ValueError where the values are not [view, row, col] of a geometry's views."""
+    """Raise ValueError unless the values are [view, row, col] of the geometry's views."""
     if (shape := np.shape(values)) != (expected := (geometry.n_views, *geometry.detector_shape)):
         raise ValueError(f"{name} have shape {shape}, the geometry says {expected} [view, row, col]")
 

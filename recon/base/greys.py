@@ -23,7 +23,7 @@ _ALL = (0.05, 99.95)
 
 
 def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
-    """Some of the finite values, in ascending order, parted into classes by thresholds between them.
+    """A sample of the finite values, ascending, split into classes by thresholds.
 
     A class is parted where two of its parts explain most of its variance (Otsu 1979, IEEE Trans. Syst. Man
     Cybern. 9, 62), and each of these likewise.
@@ -56,7 +56,7 @@ def _split(ascending: NDArray[np.float64], least: int) -> tuple[float, int]:
 
 
 def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]:
-    """Ends of grey windows of a volume by their names, the first one first.
+    """Grey windows (low, high) of a volume by name, the preferred one first.
 
     "matter" reaches from air to the densest class that leaves the class below it bright enough to be seen, "weak",
     where it differs, to the least dense class, or, where that is a pin of metal alone, to the rest of the values.
@@ -85,12 +85,12 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
 
 
 def matter_window(*arrays: NDArray[np.floating]) -> tuple[float, float]:
-    """The first of `grey_windows` of all these values together."""
+    """The window of matter of all these values together, see `grey_windows`."""
     return grey_windows(np.concatenate([np.ravel(array) for array in arrays]))["matter"]
 
 
 def apart(low: float, high: float) -> tuple[float, float]:
-    """These ends, apart also where all values are equal."""
+    """The ends of a range, kept apart where all values are equal."""
     return low, max(high, low + 1e-6 * max(abs(low), 1e-3))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from recon.base.arrays import Mask
+from recon.base.arrays import F32, Mask
 
 Image = NDArray[np.float32]
 NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
@@ -119,3 +119,17 @@ def masked(
         fill(filled[view], plan_fill(hidden))
         known[view][hidden] = 0
     return filled, known
+
+
+def usual_weight(weights: F32, data: F32) -> float:
+    """The weight of a typical ray through matter: the mean over rays with weight, each counted by its line integral.
+
+    Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
+    """
+    top = max(float(np.percentile(data.reshape(-1)[:: max(1, data.size // 100_003)], 99)), 0.0)
+    matter, weighed = 0.0, 0.0
+    for view, weight in zip(data, weights, strict=True):
+        depth = np.clip(view, 0, top) * (weight > 0)
+        matter += float(depth.sum(dtype=np.float64))
+        weighed += float((depth * weight).sum(dtype=np.float64))
+    return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))

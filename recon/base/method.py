@@ -60,7 +60,7 @@ SWEEPS_OF_TRIALS = "sweeps of trials"
 
 
 def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
-    """How many sweeps of trials are planned beside so many done, and their unit."""
+    """The planned number of trial sweeps once `trial` are done, and their unit."""
     return (usual, f"{SWEEPS_OF_TRIALS} as a rule") if trial <= usual else (most, f"{SWEEPS_OF_TRIALS} at most")
 
 
@@ -126,12 +126,12 @@ class RunControl(Checked):
 
     @property
     def stop(self) -> Stop:
-        """Asks whether the run should end with the volume so far."""
+        """The request that methods ask between steps: should the run end with the volume so far?"""
         return self.should_stop if isinstance(self.should_stop, Stop) else Stop(self.should_stop or _never)
 
     @property
     def stop_of_trials(self) -> Callable[[], bool]:
-        """Asks whether the trials should end."""
+        """The request that trials ask between sweeps."""
         return self.stop_trials or self.stop
 
     def tell(self, progress: Progress) -> None:
@@ -140,7 +140,7 @@ class RunControl(Checked):
             self.on_progress(progress)
 
     def tell_part(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
-        """Report a part of the work, or the work of a direct method, that began at a time of the clock."""
+        """Report progress without a residual: of a direct method, or of a part of the work that began at `begin`."""
         if self.on_progress is not None:
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))
 
@@ -339,7 +339,7 @@ class ChoosingMethod(Method, Protocol):
     """A method that may take the volume of another one, where that predicts views held out as well."""
 
     def as_candidate(self) -> Self:
-        """The method that makes its own volume."""
+        """The same method, which makes its own volume whatever others predict."""
 
 
 @runtime_checkable
@@ -357,7 +357,7 @@ class EarlyStopMethod(Protocol):
 
     @property
     def early_stop(self) -> bool:
-        """Whether they may end it."""
+        """Whether views held out may end the method."""
 
 
 @runtime_checkable

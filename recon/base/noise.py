@@ -320,7 +320,7 @@ def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
 
 
 def _fine_columns(sinogram: F32) -> NDArray[np.floating]:
-    """[col] how a column differs from the four beside it in most views, without what bends slowly along the row."""
+    """[col] median difference of a column from the four beside it, without slow changes along the row."""
     x = np.pad(sinogram, ((0, 0), (2, 2)), mode="edge")
     off = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
     return np.asarray(np.convolve(off, (-0.5, 1, -0.5), mode="same"))

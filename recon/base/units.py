@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import median_deviation
+from recon.base.views import spread
 
 HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
 _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
@@ -106,8 +107,7 @@ def _some(projections: NDArray[np.floating]) -> NDArray[np.float32]:
     """Views and rows of [view, row, col], evenly spread, as an array of its own."""
     views, rows, cols = projections.shape
     looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
-    some = projections[np.unique(np.linspace(0, views - 1, looked_at).astype(int))]
-    return some[:, np.unique(np.linspace(0, rows - 1, _ROWS).astype(int))].astype(np.float32)
+    return projections[spread(np.arange(views), looked_at)][:, spread(np.arange(rows), _ROWS)].astype(np.float32)
 
 
 def look_like_light(projections: NDArray[np.floating]) -> bool:

@@ -111,7 +111,7 @@ def _clean(values: F64) -> F64:
 
 
 def _across(vectors: F64, rays: F64) -> F64:
-    """What a parallel beam sees of vectors: their parts across its rays."""
+    """The parts of vectors across the rays of a parallel beam."""
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     if not lengths.all():
         raise ValueError(f"view {int(np.flatnonzero(lengths == 0)[0])}: the direction of the beam is zero")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import re
 
 import numpy as np
@@ -117,3 +118,21 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     if items.size <= n:
         return items
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
+
+
+def used_and_kept_back(
+    n_views: int, held_out: tuple[int, ...], early_stop: bool
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Numbers of the views that a fit sees, and of those held out, ascending.
+
+    Raises:
+        ValueError: numbers that name no view, or all of them; none where `early_stop` needs some.
+    """
+    kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
+    if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
+        raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
+    if kept_back.size >= n_views:
+        raise ValueError(f"all {n_views} views are held out: none is left for the fit")
+    if early_stop and not kept_back.size:
+        raise ValueError("early_stop looks at views held out, and there are none")
+    return np.setdiff1d(np.arange(n_views), kept_back), kept_back

@@ -111,7 +111,7 @@ def axis_from_opposites(projections: NDArray[np.floating], angles: Floats, searc
 
 
 def _vertex(candidates: Floats, curve: Floats, best: int) -> float:
-    """Of the parabola through the curve at three candidates."""
+    """Vertex of the parabola through the curve at three candidates."""
     near = slice(max(best - 1, 0), best + 2)
     return lowest(candidates[near], curve[near])[0]
 
@@ -209,7 +209,7 @@ class _Mirrored:
 
 
 def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """As `wedge_curves`, by pairs of opposite views.
+    """`wedge_curves` by pairs of opposite views.
 
     Raises:
         ValueError: see `axis_from_opposites`.

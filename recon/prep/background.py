@@ -106,7 +106,7 @@ class AirSums:
     """Sums over the air of views, which are all that fits of polynomials of any order need."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
-        """For views of a detector (rows, cols), binned by a factor."""
+        """Start sums for views of a detector (rows, cols), binned by a factor."""
         rows, cols = shape[0] // factor, shape[1] // factor
         v, u = coordinate(shape[0], factor), coordinate(shape[1], factor)
         odd = (np.arange(rows)[:, None] // _BLOCK + np.arange(cols) // _BLOCK) % 2

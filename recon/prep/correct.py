@@ -42,7 +42,7 @@ class CorrectionSettings:
             itself in the neighbouring views, to be replaced; inf replaces none.
         air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
         divided by their level, or by the line through the levels of both sides.
-        sample_from: line integral at the edges from which "auto" takes them for sample, see `air.edge_depth`.
+        sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
     """
 
     floor: float = 1e-4
@@ -286,20 +286,17 @@ class Correction:
             self._waiting = Transmission(data[n:].copy(), ids[n:], repaired[n:], waits), air[n:]
         if n:
             self._before = data[n - 1].copy()
-        data, floored = data[:n], 0
-        if beam is not None:
-            beam = beam[:n]
-            for view, photons in zip(data, beam, strict=True):
-                self._likelihood(view, photons)
-            live = max(int((~self.masked).sum()) * n, 1)
-            return Projections(data, ids[:n], 0.0, air[:n], self.masked, columns, replaced / live, beam)
-        for view in data:
+        data, floored, beam = data[:n], 0, None if beam is None else beam[:n]
+        for v, view in enumerate(data):
+            if beam is not None:
+                self._likelihood(view, beam[v])
+                continue
             low = view < settings.floor
             floored += int((low & ~self.masked).sum())
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * n, 1)
-        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live)
+        return Projections(data, ids[:n], floored / live, air[:n], self.masked, columns, replaced / live, beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -375,11 +372,10 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
-    if data is not None:
-        return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
-    data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
-    while parts:
-        part = parts.pop(0).data
-        data[at : at + len(part)] = part
-        at += len(part)
+    if data is None:
+        data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
+        while parts:
+            part = parts.pop(0).data
+            data[at : at + len(part)] = part
+            at += len(part)
     return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)

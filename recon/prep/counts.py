@@ -128,7 +128,7 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
 
 
 def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """As `line_integrals`, for one view [row, col] by the images of `Counts.photons`."""
+    """`line_integrals` of one view [row, col], from the images of `Counts.photons`."""
     good = np.isfinite(photons) & (beam > 0)
     light = np.where(good, beam, 1.0)
     level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))

@@ -66,7 +66,7 @@ class TabulatedEdge:
 
     @property
     def named(self) -> str:
-        """Element, shell and energy."""
+        """Name of the edge with its energy."""
         return f"{self.element} {self.shell} {self.energy:.4f} keV"
 
 

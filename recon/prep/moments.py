@@ -103,7 +103,7 @@ def _down(mass: F64) -> tuple[F64, float]:
 
 
 def _moved(mass: F64) -> tuple[F64, float]:
-    """`_down` by some rows; NaN where they do not tell."""
+    """`_down` by some rows; NaN where they do not determine it."""
     views, rows = mass.shape
     unknown = np.full(views, np.nan), np.nan
     if rows < _LEAST_ROWS:
@@ -209,7 +209,7 @@ class _Orders:
 
 
 def _stretch(bands: F64, angles: F64, axis_col: float) -> tuple[float, float]:
-    """By how much more than stated the views turned, and its standard deviation.
+    """Relative excess of the turn over the stated one, and its standard deviation.
 
     A small error of the axis is fitted beside it. Of what is nearly a body of revolution that does not suffice: what
     pixels and the axis do to its moments looks like an error of the angles. So a second fit has all multiples of the

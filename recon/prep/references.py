@@ -184,7 +184,7 @@ def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Ima
 
 
 def _around_edge(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """`_around` where some neighbours may lie beyond the edge."""
+    """`_around` for pixels whose neighbours may lie beyond the edge."""
     rows, cols = image.shape
     nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)

@@ -81,7 +81,7 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
 
 
 def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
-    """The line by curves [band, candidate].
+    """The line through the axes of bands, from their mismatch [band, candidate].
 
     Raises:
         ValueError: it has no clear optimum.

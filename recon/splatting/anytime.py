@@ -25,7 +25,7 @@ from recon.splatting.optimise import FitState, renders, settle, volume_of
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector
 
 HALF = 60.0  # steps after which the rates are half of the first ones
@@ -167,7 +167,7 @@ class PredictionErrors:
     def of(
         cls, images: Sequence[F32], geometry: Geometry, held_out: Sequence[int], render: Callable[[int], F32]
     ) -> Self:
-        """In the last views held out and those before them; by FBP of all that are not held out.
+        """Errors in the last views held out and those before them; FBP is of all views that are not held out.
 
         NaN where none is, or the beam is not one of FBP's slices.
 
@@ -200,7 +200,7 @@ class BetterVolume:
     def of(
         cls, state: FitState, problem: FitProblem, settings: FitSettings, grid: Grid, held_out: Sequence[int]
     ) -> Self:
-        """Of the views of a problem, from which a fit without those held out has this state."""
+        """The better volume of a problem's views; the fit in this state has not seen those held out."""
 
         def render(view: int) -> F32:
             return problem.backend.numpy(next(renders(state, problem, settings, [view])))

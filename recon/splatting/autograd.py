@@ -15,7 +15,7 @@ from recon.splatting.backend import Backend, Cpu, Pass
 
 
 class On(NamedTuple):
-    """What raw parameters are of, and what computes them; `unit` is that of the densities."""
+    """Unit of the densities, kernel and backend of raw parameters."""
 
     unit: float
     kernel: Kernel

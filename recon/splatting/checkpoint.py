@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.kernel import Kernel
+from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, Cpu
 from recon.splatting.optimise import FitState, settle
-from recon.splatting.settings import NAMES
+from recon.splatting.problem import FitProblem
+from recon.splatting.settings import NAMES, FitSettings
 
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
@@ -103,3 +106,45 @@ def decisions_from(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
         if not np.isfinite(values).all():
             raise ValueError(f"{name} of the checkpoint is {values.tolist()}, expected finite numbers")
     return {name: [values.tolist()] for name, values in decided.items()}
+
+
+_BEST = "best."  # names of the best model's arrays in a checkpoint begin so
+
+
+@dataclass(eq=False)
+class HeldOutTracker:
+    """Tracks the residual of views held out, and keeps the model with the lowest one."""
+
+    problem: FitProblem | None
+    settings: FitSettings
+    value: float = float("nan")
+    best: float = float("inf")
+    best_step: int = 0
+    kept: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    @classmethod
+    def over(
+        cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
+    ) -> HeldOutTracker:
+        """A tracker for a fit at `step`, or the tracker of a checkpoint."""
+        if problem is None or "watch" not in resume:
+            return cls(problem, settings, best_step=step)
+        best, best_step = resume["watch"]
+        kept = {name.removeprefix(_BEST): values for name, values in resume.items() if name.startswith(_BEST)}
+        return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The tracker as arrays of a checkpoint."""
+        if self.problem is None:
+            return {}
+        best = {_BEST + name: values for name, values in self.kept.items()}
+        return {"watch": np.array([self.best, self.best_step]), **best}
+
+    def measure(self, state: FitState, keep: bool) -> None:
+        if self.problem is None:
+            return
+        self.value = fit.misfit_of(state, self.problem, self.settings)
+        if self.value < self.best:
+            self.best, self.best_step = self.value, state.step
+            if keep:
+                self.kept = arrays_of(state, self.problem.backend)

@@ -48,7 +48,7 @@ _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
 class _Watch:
-    """Tells of sweeps, and asks whether to stop.
+    """Reports sweeps, and asks whether to stop.
 
     Attributes:
         ended: the last answer was yes.
@@ -87,7 +87,7 @@ Fit = Callable[[ReconProblem, RunControl, float], Reconstruction]
 
 @dataclass(eq=False)
 class Candidates:
-    """What candidates leave of views held out, [view] each; None: not tried.
+    """Residuals of views held out by each candidate, [view]; None: not tried.
 
     Attributes:
         direct, smooth, patches, fit: FBP, total variation, sparse patches, and a fit that the better of these refines.
@@ -102,7 +102,7 @@ class Candidates:
 
     @property
     def by_voxels(self) -> F64 | None:
-        """The least residual of the two priors."""
+        """The smaller residual of the two priors."""
         tried = [each for each in (self.smooth, self.patches) if each is not None]
         return min(tried, key=lambda each: float(each.mean()), default=None)
 
@@ -146,10 +146,10 @@ class _Planning:
 
     def of_fit(self, trial: HeldOutTrial, weight: float, strength: float, share: float) -> F64 | None:
         """Residuals [view held out] of a fit of the trial's views, refined with the prior; None: it refuses them."""
-        part, wide = trial.problem, trial.wide.seen()
-        seen, cols = wide.projector, trial.wide.cols
-        weights = None if wide.weight is None else projection_images(wide.weight)
-        views = ReconProblem(projection_images(wide.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
+        part, whole = trial.problem, trial.all_columns.seen()
+        seen, cols = whole.projector, trial.all_columns.cols
+        weights = None if whole.weight is None else projection_images(whole.weight)
+        views = ReconProblem(projection_images(whole.views), seen.geometry, seen.grid, DataUse(weights), 0, "cpu")
         control = RunControl(lambda: not part.go_on(0, 0.0), now=self.control.now)
         try:
             fitted = self.fit(views, control, share)
@@ -159,10 +159,10 @@ class _Planning:
             None if views is None else np.ascontiguousarray(projection_lines(views)[:, cols])
             for views in (
                 beyond_voxels(fitted.gaussians, geometry, fitted.volume.grid, self.settings)
-                for geometry in (seen.geometry, trial.wide.unseen)
+                for geometry in (seen.geometry, trial.all_columns.unseen)
             )
         )
-        refined = trial.made(
+        refined = trial.volume_by(
             lambda some, x: refine(
                 _without(some, beyond), x, weight, TRIAL_THRESHOLD * strength, FINISH_SWEEPS, TRIAL_STEPS
             ),
@@ -224,7 +224,7 @@ def refine(
 
 
 def judged(problem: ReconProblem, settings: FitSettings, control: RunControl, fit: Fit) -> Candidates:
-    """What total variation, sparse patches and a fit leave of views held out, and the decisions on their prior.
+    """Residuals of views held out by total variation, sparse patches and a fit, and the decisions on their prior.
 
     The trials see sixteen rows. Each candidate predicts views by its whole model: Gaussians show what lies beyond the
     box, and edges within voxels, too. A fit of all views would know the views held out, so this one is of its own. It

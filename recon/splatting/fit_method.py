@@ -1,4 +1,4 @@
-"""FitMethod: the interface of a fit of Gaussians; StreamingMethod: methods whose volume can grow while views arrive."""
+"""FitMethod: the interface of a fit of Gaussians, whose volume can grow while views arrive."""
 
 from __future__ import annotations
 
@@ -62,10 +62,8 @@ class FitMethod(Method, Protocol):
     def finish_sweeps(self) -> int:
         """Sweeps of total variation in the finish; 0: there is none."""
 
-
-@runtime_checkable
-class StreamingMethod(FitMethod, Protocol):
-    """A method whose volume can grow while views arrive; `seconds` is the time of the last round, over all views."""
-
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit of views with the geometry of `template`, whose angles are ignored."""
+        """A fit that grows while views with the geometry of `template`, whose angles are ignored, arrive.
+
+        `seconds` is then the time of the last round, over all views.
+        """

@@ -62,7 +62,7 @@ class Gaussians:
         density_unit: float | None = None,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> Gaussians:
-        """From positions [n, 3] mm, standard deviations [n, 3] or [n] mm and densities [n] 1/mm, all positive.
+        """Gaussians at positions [n, 3] mm, with deviations [n, 3] or [n] mm and densities [n] 1/mm, all positive.
 
         Raises:
             ValueError: where a scale or a density is not positive and finite.
@@ -107,7 +107,7 @@ class Gaussians:
         return replace(self, **some)
 
     def widened(self, variance: float) -> Gaussians:
-        """With this variance (mm²) more along every direction, and the same mass."""
+        """The same Gaussians with a larger variance (mm²) along every direction, and the same mass."""
         import torch
 
         if variance <= 0:

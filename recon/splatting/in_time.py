@@ -16,9 +16,17 @@ from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, Run
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Rates, Work
 from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE, SUBSETS, TV_STEPS, finish
-from recon.splatting.fit_method import FitMethod, StreamingMethod
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import SCALED_BY, count_for, joined_for, sample_gaussians, start_method
+from recon.splatting.initialise import (
+    SCALED_BY,
+    count_for,
+    default_count,
+    joined_for,
+    sample_gaussians,
+    start_method,
+    sweeps_of_start,
+)
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
@@ -87,7 +95,7 @@ def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
 
 
 class FinishPlan(NamedTuple):
-    """What a finish may take.
+    """Length of a finish: its sweeps, seconds and trials.
 
     Attributes:
         sweeps: of total variation; None: as many as it makes by default, and steps with sparse patches.
@@ -150,7 +158,7 @@ class LastRound:
     """
 
     fit: StreamingFit
-    method: StreamingMethod
+    method: FitMethod
     seconds: float
     began: float
     before: Sequence[Progress] = ()
@@ -219,7 +227,7 @@ _RENDER = 1 / 3  # of a view's share in a step, which renders it, and goes back 
 
 
 def covered(voxels: float, gaussians: float) -> float:
-    """In proportion to the pixels that Gaussians cover in a view, whose widths are their distances."""
+    """Proportional to the pixels that Gaussians cover in a view, as wide as their distances."""
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
@@ -248,7 +256,7 @@ def fit_costs(method: FitMethod, geometry: Geometry, grid: Grid) -> Costs:
 
 
 def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
-    """From the first volume to that of the Gaussians."""
+    """Work from the first volume to the volume of the Gaussians."""
     cone = geometry.is_cone
     field = Grid.for_fit(geometry, grid)
     voxels, usual = math.prod(field.shape), count_for(field, cone)
@@ -267,13 +275,13 @@ def _fit(method: FitMethod, geometry: Geometry, grid: Grid, steps: int) -> Work:
 
 
 def _view(method: FitMethod, geometry: Geometry, voxels: float, gaussians: float) -> Work:
-    """A view of a step of a fit."""
+    """Work of one view in a step of a fit."""
     reach = method.fit.kernel.reach(method.fit.truncation.sigmas) / FitSettings().kernel.radius
     return Work.of(f"view, {'cone' if geometry.is_cone else 'parallel'}", 1, covered(voxels, gaussians) * reach**2)
 
 
 def _rendered(method: FitMethod, geometry: Geometry, grid: Grid) -> Work:
-    """All views of the Gaussians, and once more of what no voxels explain."""
+    """Work of rendering all views of the Gaussians, and once more the part that no voxels explain."""
     field = Grid.for_fit(geometry, grid)
     count = method.gaussians if isinstance(method.gaussians, int) else count_for(field, geometry.is_cone)
     return 2 * _RENDER * geometry.n_views * _view(method, geometry, math.prod(field.shape), count)
@@ -305,3 +313,31 @@ def speeds_of(geometry: Geometry, grid: Grid, rates: Rates) -> Speeds:
     return Speeds(
         volume.seconds(rates), start.seconds(rates), step.seconds(rates), fill.seconds(rates), sweep, trials
     )  # fmt: skip
+
+
+_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
+
+
+def factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
+    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
+
+    Warns:
+        UserWarning: they do not suffice for a start from all pixels.
+    """
+    if isinstance(method.gaussians, Gaussians):
+        return 1
+    count = method.gaussians or default_count(geometry, grid.voxel_size)
+    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
+    needed += first_draw_seconds(grid, count, now)
+    remaining = max(end - now(), 0.0)
+    if needed <= remaining:
+        return 1
+    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
+    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
+    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
+    warnings.warn(
+        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
+        f"{then if factor > 1 else 'it ends late'}",
+        stacklevel=2,
+    )
+    return factor

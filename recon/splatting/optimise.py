@@ -184,7 +184,7 @@ class _Update:
 def _fused(
     state: FitState, problem: FitProblem, settings: FitSettings, update: _Update, box: _RandomBox | None
 ) -> FusedStep | None:
-    """What makes whole steps of this state on the device, kept from step to step while nothing changes its plan."""
+    """The fused step of this state on the device, kept from step to step while its plan stays."""
     shape, before = None if box is None else box.shape, state.fused
     key = (
         problem.loss, problem.grid, settings.truncation, settings.rays, settings.views_per_step,
@@ -270,9 +270,7 @@ def gaussians_of(state: FitState, backend: Backend[Any] | None = None) -> Gaussi
 
     settle(state)
     device = backend or Cpu()
-    means, log_scales, quaternions, raw = (
-        torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES
-    )  # fmt: skip
+    means, log_scales, quaternions, raw = (torch.from_numpy(device.numpy(state.parameters[name])) for name in NAMES)
     return Gaussians(means, log_scales, quaternions, raw, state.unit, state.kernel)
 
 
@@ -331,12 +329,8 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     fresh = change.keep.size
     if origin.size == 0:
         return  # all Gaussians are faint, as in empty views: later views may need them
-    grown = {
-        "means": change.means,
-        "log_scales": change.log_scales,
-        "quaternions": p["quaternions"][origin],
-        "raw": change.raw,
-    }
+    parts = change.means, change.log_scales, p["quaternions"][origin], change.raw
+    grown = dict(zip(NAMES, parts, strict=True))
     order = _order(grown)
     if state.mean is not None:
         for name, new in grown.items():

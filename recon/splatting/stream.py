@@ -198,7 +198,7 @@ class StreamingFit:
             self._unseen = []
 
     def _others(self, images: F32, which: NDArray[np.intp]) -> bool:
-        """These line integrals differ from those of the model's views `which` by more than a fifth, in squares."""
+        """Whether these line integrals differ from the model's views `which` by more than a fifth, in squares."""
         assert self._problem is not None
         changed = total = 0.0
         for view, image in zip(which, images, strict=True):
@@ -329,7 +329,7 @@ class StreamingFit:
         return None if self._state is None else fit.gaussians_of(averaged(self._state))
 
     def progress(self) -> Progress:
-        """Where the fit stands."""
+        """The progress so far."""
         seconds, state = self._now() - self._start, self._state
         if state is None:
             return Progress(0, 0, seconds, float("nan"), float("nan"), 0, self.n_views)

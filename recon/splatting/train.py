@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import operator
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -17,21 +16,21 @@ from recon.assess.time_model import MODEL_STEPS, best_steps
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
+from recon.base.masks import masked, usual_weight
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.ray_width import NO_WIDTH
+from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
-from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
+from recon.splatting.checkpoint import HeldOutTracker, arrays_of, decisions_from, decisions_of, state_from
 from recon.splatting.finish import Candidates, finish, judged
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
     FinishPlan,
+    factor_in_time,
     fill_seconds,
-    first_draw_seconds,
-    first_sweep_seconds,
     planned_finish,
 )
 from recon.splatting.initialise import (
@@ -40,7 +39,6 @@ from recon.splatting.initialise import (
     joined_for,
     mean_change,
     place,
-    sweeps_of_start,
 )
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
@@ -57,48 +55,7 @@ _DECIDED = "candidate", UNITS, "weight", "strength"  # decisions that a checkpoi
 
 _TIMED = 3  # steps after which a fit's seconds are planned
 _LOOK = 50  # steps between two measurements of the views held out
-_BEST = "best."  # names of the best model's arrays in a checkpoint begin so
-_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
 _PATIENCE = 0.2  # share of the planned steps, and at least six measurements, that may pass without a better model
-
-
-@dataclass(eq=False)
-class _HeldOutTracker:
-    """Tracks the residual of views held out, and keeps the model with the lowest one."""
-
-    problem: FitProblem | None
-    settings: FitSettings
-    value: float = float("nan")
-    best: float = float("inf")
-    best_step: int = 0
-    kept: dict[str, NDArray[Any]] = field(default_factory=dict)
-
-    @classmethod
-    def over(
-        cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
-    ) -> _HeldOutTracker:
-        """A tracker for a fit at `step`, or the tracker of a checkpoint."""
-        if problem is None or "watch" not in resume:
-            return cls(problem, settings, best_step=step)
-        best, best_step = resume["watch"]
-        kept = {name.removeprefix(_BEST): values for name, values in resume.items() if name.startswith(_BEST)}
-        return cls(problem, settings, best=float(best), best_step=int(best_step), kept=kept)
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Its arrays in a checkpoint."""
-        if self.problem is None:
-            return {}
-        best = {_BEST + name: values for name, values in self.kept.items()}
-        return {"watch": np.array([self.best, self.best_step]), **best}
-
-    def look(self, state: FitState, keep: bool) -> None:
-        if self.problem is None:
-            return
-        self.value = fit.misfit_of(state, self.problem, self.settings)
-        if self.value < self.best:
-            self.best, self.best_step = self.value, state.step
-            if keep:
-                self.kept = arrays_of(state, self.problem.backend)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +104,7 @@ class _Views:
         used, kept_back = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
         data, weights = masked(problem.projections, problem.use.weights)
         if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
-            weights = weights / np.float32(_usual(weights, data))
+            weights = weights / np.float32(usual_weight(weights, data))
         blank = kept_back[~data[kept_back].any(axis=(1, 2))]
         if blank.size:
             raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
@@ -178,7 +135,7 @@ class _Views:
 
 @dataclass(eq=False)
 class _Length:
-    """How long a fit takes.
+    """Length of a fit, in steps or seconds.
 
     Attributes:
         steps: end the fit; None: only `seconds` end it.
@@ -195,12 +152,12 @@ class _Length:
     planned: bool
 
     def fraction(self, step: int, spent: float) -> float:
-        """How far the fit has come after so many steps and seconds, 0..1."""
+        """Share of the fit that is done after so many steps and seconds, 0..1."""
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
     def plan(self, plan: FinishPlan, spent: float) -> None:
-        """Keep time for the finish."""
+        """Reserve time for the finish."""
         self.sweeps, finishing, self.trials = plan
         self.planned = True
         if self.seconds is not None:
@@ -220,7 +177,7 @@ class _Run:
     end: float
     state: FitState
     fitting: FitProblem
-    tracker: _HeldOutTracker
+    tracker: HeldOutTracker
     length: _Length
     settings: FitSettings
     history: list[Progress] = field(default_factory=list)
@@ -290,7 +247,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
 
 
 def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
-    """What a fit, and methods on voxels, leave of views held out."""
+    """Residuals of views held out by a fit and by methods on voxels."""
 
     def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
         share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]
@@ -314,7 +271,7 @@ def _started(
     now, settings, start, backend = control.now, method.fit, method.gaussians, backend_for(problem.device)
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
-        factor = 1 if method.seconds is None else _factor_in_time(method, views.seen, views.field, now, end)
+        factor = 1 if method.seconds is None else factor_in_time(method, views.seen, views.field, now, end)
         if not isinstance(start, Gaussians):
             start = place(
                 views.p, views.seen, views.field, views.count, np.random.default_rng(problem.seed),
@@ -327,7 +284,7 @@ def _started(
     if settings.tv_weight is None:
         fitting = replace(fitting, change=decide("change", lambda: mean_change(views.p, views.seen, views.field)))
     unseen = views.unseen(fitting, settings, state.unit)
-    tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
+    tracker = HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
     seconds = method.seconds
     if seconds is not None:
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
@@ -358,7 +315,7 @@ def _steps(run: _Run) -> None:
                 expected = state.step + max(0.0, length.seconds - spent) / step
                 run.settings = in_steps(method.fit, min(expected, length.steps or expected))
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
-            run.tracker.look(state, method.early_stop)
+            run.tracker.measure(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
             reported = now()
             run.report(reported)
@@ -368,7 +325,7 @@ def _steps(run: _Run) -> None:
         patience = max(6 * _LOOK, _PATIENCE * (length.steps or 0))
         if method.early_stop and state.step - run.tracker.best_step > patience:
             break
-    run.tracker.look(state, method.early_stop)
+    run.tracker.measure(state, method.early_stop)
     run.report(now())
 
 
@@ -402,31 +359,6 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
     return finished, sweeps
 
 
-def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
-    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
-
-    Warns:
-        UserWarning: they do not suffice for a start from all pixels.
-    """
-    if isinstance(method.gaussians, Gaussians):
-        return 1
-    count = method.gaussians or default_count(geometry, grid.voxel_size)
-    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
-    needed += first_draw_seconds(grid, count, now)
-    remaining = max(end - now(), 0.0)
-    if needed <= remaining:
-        return 1
-    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
-    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * remaining), factors[-1])
-    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
-    warnings.warn(
-        f"{remaining:.3g} s are left for the start of the fit, which takes about {needed:.3g} s: "
-        f"{then if factor > 1 else 'it ends late'}",
-        stacklevel=2,
-    )
-    return factor
-
-
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
     """The plan of the finish, if so many seconds remain after first steps of `step` seconds each."""
     return planned_finish(run.method, remaining, best_steps(run.method.name) * step, run.views.fitted, run.control.now)
@@ -440,38 +372,6 @@ def _predicts_worse(finished: Volume, fitted: Volume, unseen: F32, views: Geomet
         for volume in (finished, fitted)
     )
     return bool(after.mean() > 10 ** (0.1 / 10) * before.mean())
-
-
-def _usual(weights: F32, data: F32) -> float:
-    """The weight of a typical ray through matter: the mean over rays with weight, each counted by its line integral.
-
-    Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
-    """
-    top = max(float(np.percentile(data.reshape(-1)[:: max(1, data.size // 100_003)], 99)), 0.0)
-    matter, weighed = 0.0, 0.0
-    for view, weight in zip(data, weights, strict=True):
-        depth = np.clip(view, 0, top) * (weight > 0)
-        matter += float(depth.sum(dtype=np.float64))
-        weighed += float((depth * weight).sum(dtype=np.float64))
-    return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
-
-
-def used_and_kept_back(
-    n_views: int, held_out: tuple[int, ...], early_stop: bool
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of the views that a fit sees, and of those held out, ascending.
-
-    Raises:
-        ValueError: numbers that name no view, or all of them; none where `early_stop` needs some.
-    """
-    kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))
-    if kept_back.size and not (kept_back[0] >= 0 and kept_back[-1] < n_views):
-        raise ValueError(f"held_out must name views 0 to {n_views - 1}, got {kept_back[[0, -1]].tolist()}")
-    if kept_back.size >= n_views:
-        raise ValueError(f"all {n_views} views are held out: none is left for the fit")
-    if early_stop and not kept_back.size:
-        raise ValueError("early_stop looks at views held out, and there are none")
-    return np.setdiff1d(np.arange(n_views), kept_back), kept_back
 
 
 def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:

@@ -17,7 +17,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.iterative import solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector
@@ -69,7 +69,7 @@ class Gain:
 
     @classmethod
     def of(cls, n_views: int, planned: int, samples: ArrayLike) -> Gain:
-        """From repeated predictions in dB, two or more."""
+        """The gain from two or more repeated predictions in dB."""
         values = np.asarray(samples, np.float64)
         mean, error = float(values.mean()), 2 * float(values.std(ddof=1)) / math.sqrt(values.size)
         return cls(n_views, planned, mean, mean - error, mean + error)

@@ -11,16 +11,18 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
-from recon.base.empirical import ENOUGH_MATTER, ONE_IN
+from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.volume import Grid
+from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
@@ -29,11 +31,6 @@ from recon.voxels.voxel_problem import VoxelProblem, whitened
 TRIAL_SWEEPS = 16
 """Sweeps of total variation. Without, after 8, a weight twice as heavy seems best: -0.8 to -2.9 dB on a teapot."""
 
-AIR = 0.03
-"""Of the largest line integral: trials leave out columns below it. Without: a tooth takes 129 CPU s instead of 55."""
-
-BESIDE_MATTER = 0.05
-"""Of the width of the matter: air on either side that they keep, so that no matter is cut at the edge."""
 
 LEAST_VIEWS = 2 * ONE_IN
 
@@ -52,7 +49,7 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 
 
 def beyond_chance(gains: F64, errors: float) -> bool:
-    """The mean of gains [view held out] is more than so many of its standard errors, by their scatter."""
+    """Whether the mean gain [view held out] exceeds so many of its standard errors."""
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
     return float(gains.mean()) > errors * scatter
 
@@ -85,94 +82,40 @@ def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.in
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
 
 
-def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
-    """Rows first..stop of a parallel beam, and the slices that they see, as wide as `grid`.
-
-    If rows do not show slices, these are all slices that any ray to the rows meets.
-    """
-    views = geometry.rows(first, stop)
-    slab = Grid.matching(views)
-    if not geometry.rows_show_slices:
-        low, high = views.heights
-        slices = math.ceil((high - low + 2 * geometry.lean) / geometry.sample_pitch)
-        slab = replace(slab, shape=(slices, *slab.shape[1:]), centre=((low + high) / 2, 0.0, 0.0))
-    shape, centre = (slab.shape[0], *grid.shape[1:]), (slab.centre[0], *grid.centre[1:])
-    return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
-
-
-def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slice, Geometry, Grid] | None:
-    """The columns of `images` [view, row, col] that see matter, with some air beside it, and the box that holds it.
-
-    None: they are all columns, or rows do not show slices around the detector's middle.
-    """
-    if not geometry.rows_show_slices or geometry.is_off_middle or any(grid.centre[1:]):
-        return None
-    deepest = images.mean(axis=1).max(axis=0)
-    there = np.flatnonzero(deepest > AIR * deepest.max())
-    axis, width = geometry.axis_col + geometry.shifts[:, 0], geometry.detector_shape[1]
-    if not there.size:
-        return None
-    half = (1 + 2 * BESIDE_MATTER) * max(axis.max() - there[0], there[-1] - axis.min()) + 2
-    first, stop = max(0, math.floor(axis.min() - half)), min(width, math.ceil(axis.max() + half) + 1)
-    if stop - first == width:
-        return None
-    views = replace(
-        geometry, detector_shape=(geometry.detector_shape[0], stop - first), axis_col=geometry.axis_col - first
-    )
-    across = 2 * half * geometry.sample_pitch / grid.voxel_size
-    sides = (n - 2 * max(0, math.floor((n - across) / 2)) for n in grid.shape[1:])
-    return slice(first, stop), views, replace(grid, shape=(grid.shape[0], *sides))
-
-
-def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
-    """So many rows in the middle of a cone, as a geometry, and the box that holds their rays.
-
-    None: views of a circle are displaced along the rows, or these rows show little of the matter in `data` [view, row,
-    col].
-    """
-    off, around = geometry.offsets[:, 1], not geometry.centres.any()
-    first = round(geometry.axis_row + (0.0 if around else float(np.median(off))) - (height - 1) / 2)
-    rows = slice(first, first + height)
-    if (around and np.abs(off).max() > 1) or first < 0 or rows.stop > geometry.detector_shape[0]:
-        return None
-    some = data[:: max(1, len(data) // 8)]
-    if np.abs(some[:, rows]).sum() < ENOUGH_MATTER * np.abs(some[:, busiest_rows(some, height)]).sum():
-        return None
-    # At the far side of the field.
-    climb = 0.0 if around else float(np.ptp(off))
-    tall = (height + 1 + climb) * geometry.sample_pitch + 2 * geometry.lean
-    tall *= 1 + geometry.reach / geometry.source_distance
-    slices = math.ceil(tall / grid.spacing[0])
-    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
-    return rows, geometry.rows(rows.start, rows.stop), box
-
-
-def busiest_rows(data: F32, height: int) -> slice:
-    """The neighbouring rows with most matter of line integrals [view, row, col]."""
-    rows = data.shape[1]
-    if rows <= height:
-        return slice(0, rows)
-    some = data[:: max(1, len(data) // 8)]
-    matter = np.concatenate(([0.0], np.cumsum(np.abs(some).sum(axis=(0, 2), dtype=np.float64))))
-    first = int(np.argmax(matter[height:] - matter[:-height]))
-    return slice(first, first + height)
-
-
 def choice_sweeps(geometry: Geometry) -> float:
     """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
     share = min(1.0, TRIAL_ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
 
+def predicted_views(
+    method: Method, data: F32, geometry: Geometry, grid: Grid, known: NDArray[Any] | None, one_in: int
+) -> tuple[NDArray[np.intp], F32]:
+    """Numbers of the views held out, one in so many by angle, and their images [view, row, col] by the others.
+
+    Args:
+        method: that makes the volume.
+        data: line integrals [view, row, col].
+        known: [row, col] weights of pixels; None: one for all.
+    """
+    order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
+    unseen = order[1::one_in]
+    seen = np.setdiff1d(order, unseen)
+    weights = None if known is None else np.broadcast_to(known, data[seen].shape).astype(np.float32)
+    part = ReconProblem(data[seen], geometry.select(seen), grid, DataUse(weights), 0, "cpu")
+    volume = method.run(part, RunControl()).volume
+    return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)
+
+
 @dataclass(frozen=True, eq=False)
-class Preferred:
+class BestStrength:
     """The strength of a prior that views held out prefer, and the least residual in its search, of each [view]."""
 
     strength: float
     residuals: F64
 
 
-def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Preferred | None:
+def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> BestStrength | None:
     """The strength of a prior whose residual is least, sought in octaves from `first`.
 
     No strength is simpler or cheaper than another, so that chance is no reason for one. (The strongest within one
@@ -206,7 +149,7 @@ def preferred_strength(residuals_of: Callable[[float], F64], first: float) -> Pr
     if octave - 1 in tried and octave + 1 in tried:
         weaker, stronger = mean(octave - 1) - mean(octave), mean(octave + 1) - mean(octave)
         vertex += (weaker - stronger) / (2 * (weaker + stronger)) if weaker + stronger > 0 else 0.0
-    return Preferred(first * 2.0**vertex, tried[octave])
+    return BestStrength(first * 2.0**vertex, tried[octave])
 
 
 def choose_weight(
@@ -228,15 +171,15 @@ def choose_weight(
         preferred = None if judge is None else preferred_strength(judge.of_weight, balance.first)
         if judge is None or preferred is None:
             return [balance.first, balance.noise]
-        judge.keep("weight", preferred)
+        judge.remember("weight", preferred)
         return [preferred.strength]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], sweeps) if noise else first
 
 
-class WideViews(NamedTuple):
-    """The rows of a trial with all columns, air beside the sample, too: a fit of narrower views is a poorer one.
+class AllColumns(NamedTuple):
+    """The rows of a trial with all columns, including air: a fit of narrower views is poorer.
 
     Attributes:
         cols: those of the trial.
@@ -256,16 +199,16 @@ class HeldOutTrial:
         problem: of the slab.
         start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
         unseen: the views held out.
-        wide: both with all columns.
+        all_columns: both with all columns.
         direct: the first volume is FBP.
         smooth: the volume of total variation that predicts these best, of those made so far.
     """
 
     def __init__(
-        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, wide: WideViews, direct: bool
+        self, problem: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns, direct: bool
     ) -> None:  # fmt: skip
         self.problem, self.start, self.unseen = replace(problem, go_on=self._go_on), start, unseen
-        self.wide, self.direct = wide, direct
+        self.all_columns, self.direct = all_columns, direct
         self._subsets = Subsets.of(problem, SUBSETS)
         self._ended, self._least = False, math.inf
         self._known: dict[tuple[str, float], F64] = {}
@@ -323,8 +266,8 @@ class HeldOutTrial:
             depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
         others, judges = split_views(views)
-        wide = WideViews(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
-        return cls(seen, np.maximum(first, 0, out=first) if direct else first, unseen, wide, direct)
+        all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
+        return cls(seen, np.maximum(first, 0, out=first) if direct else first, unseen, all_columns, direct)
 
     def _go_on(self, sweep: int, residual: float) -> bool:
         self._ended = self._ended or not self.problem.trial_goes_on()
@@ -332,36 +275,34 @@ class HeldOutTrial:
 
     @property
     def ended(self) -> bool:
-        """The trials were ended; no volume is judged any more."""
+        """Whether the trials were ended; no volume is judged any more."""
         return self._ended
 
     def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
-        """`residuals` of the volume of this prior and strength; kept, so that each volume is made once."""
+        """Residuals for this prior and strength; each volume is made once."""
         if (prior, strength) not in self._known:
-            self._known[prior, strength] = self.residuals(volume(strength))
+            x = volume(strength)
+            residuals = self._known[prior, strength] = self.residuals(x)
+            if prior == "weight" and residuals.mean() < self._least:
+                self.smooth, self._least = x, float(residuals.mean())
         return self._known[prior, strength]
 
-    def keep(self, prior: str, preferred: Preferred) -> None:
-        """Take the least residual of a search as that of the strength it prefers."""
+    def remember(self, prior: str, preferred: BestStrength) -> None:
+        """Record the least residual of a search for the strength that it prefers."""
         self._known[prior, preferred.strength] = preferred.residuals
 
     def of_weight(self, weight: float) -> F64:
-        """`residuals` of total variation with this weight; the best volume of all is kept as `smooth`."""
-        if ("weight", weight) not in self._known:
-            volume = self.with_weight(weight)
-            residuals = self._known["weight", weight] = self.residuals(volume)
-            if residuals.mean() < self._least:
-                self.smooth, self._least = volume, float(residuals.mean())
-        return self._known["weight", weight]
+        """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
+        return self.residuals_of("weight", weight, self.with_weight)
 
     def with_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""
-        return self.made(lambda part, x: ordered_fista(
+        return self.volume_by(lambda part, x: ordered_fista(
             part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
         ))  # fmt: skip
 
-    def made(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
-        """The volume that `make` makes of the first one, which it may overwrite; that one where the trials ended."""
+    def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
+        """The volume that `make` computes from a copy of the first one; that copy once the trials ended."""
         x = (self.start if start is None else start).copy()
         if self._ended:
             return x

@@ -53,7 +53,7 @@ def _silent(*_: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """What is called between iterations; something true that it returns ends them.
+    """Callbacks between iterations; a true result ends them.
 
     Attributes:
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
@@ -80,7 +80,7 @@ def solve(
     watch: Watch = _UNWATCHED,
     decide: Decisions | None = None,
 ) -> Volume:
-    """Line integrals to a volume on the projector's grid.
+    """Reconstruct line integrals on the projector's grid.
 
     Memory: as each method's settings say, in volumes of the grid and in copies of the projections, float32.
 

@@ -7,15 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import (
-    binary_closing,
-    binary_dilation,
-    binary_erosion,
-    binary_opening,
-    find_objects,
-    gaussian_filter,
-    label,
-)
+from scipy import ndimage
+from scipy.ndimage import binary_dilation, gaussian_filter
 
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
@@ -36,7 +29,7 @@ _BLUR, _SIGMAS, _LEAST = 1.0, 4.0, 0.005  # pixels; of the blurred noise; of the
 _WHOLE = 0.999  # share of a voxel's rays through air
 _MOST, _MOST_WHOLE = 2**18, 2**21  # voxels looked at, or one slice; where rows show no slices, those of a volume
 _WORK = 40  # bytes of a voxel that is looked at
-_LEAST_AIR = 100  # voxels whose level counts
+_LEAST_AIR = 100  # voxels, or blocks of them, whose level counts
 _MATTER, _FAINT = 99.5, 0.05  # percentile that is the density unit; share of it that counts
 
 
@@ -214,7 +207,7 @@ def unexplained(
     rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
-    matter = np.stack([binary_closing(image > level, iterations=_CLOSED) for image in part.data])
+    matter = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
         return None
     measured, projector = projections[:, rows], Projector(views, part.grid)
@@ -276,10 +269,8 @@ def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[
 _BLOCKS = 96  # blocks of a volume along its longest side, at most
 _SMOOTHED_BLOCKS, _ABOVE_AIR = 1.5, 5.0  # blocks; of air
 _MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
-_LEAST_AIR_BLOCKS = 100  # blocks
 _LEFT = 0.5  # share of FBP's density: a voxel with less has lost it
-_CORE = 3, 5, 5  # blocks along z, y and x of the boxes that a region is made of
-_LEAST_REGION = 64  # blocks of a region
+_CORE, _LEAST_REGION = (3, 5, 5), 64  # blocks along z, y and x of the boxes of a region; blocks of a region
 _BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 
@@ -319,7 +310,7 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     inside = np.repeat(disc[None], len(shown), axis=0)
     if seen is not None:
         blocks = seen[: len(shown) * factor].reshape(-1, factor).all(axis=1)
-        inside &= binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
+        inside &= ndimage.binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
     smooth = [min(_SMOOTHED_BLOCKS, n / 8) for n in shown.shape]
     shown, found = (gaussian_filter(values, smooth, mode="nearest") for values in (shown, found))
     if not inside.any():
@@ -327,20 +318,20 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     level, noise = air_level(shown[inside])
     matter = (shown - level > _ABOVE_AIR * noise) & inside
     air = inside & ~binary_dilation(matter, iterations=_MARGIN)
-    if noise == 0 or air.sum() < _LEAST_AIR_BLOCKS:
+    if noise == 0 or air.sum() < _LEAST_AIR:
         return None
     own = float(found[air].mean(dtype=np.float64))
     comparison = LostMatter()
     gone = matter & (found - own < _LEFT * (shown - level))
     core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
-    parts, n = label(binary_opening(gone, np.ones(core)))
+    parts, n = ndimage.label(ndimage.binary_opening(gone, np.ones(core)))
     sizes = np.bincount(parts.ravel())[1:]
     if not n or sizes.max() < _LEAST_REGION:
         return comparison
     at = int(sizes.argmax())
     region = parts == at + 1
     kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
-    spans = tuple((part.start * factor, part.stop * factor) for part in find_objects(parts)[at])
+    spans = tuple((part.start * factor, part.stop * factor) for part in ndimage.find_objects(parts)[at])
     return LostMatter((spans[0], spans[1], spans[2]), kept)
 
 

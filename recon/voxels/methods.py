@@ -72,7 +72,7 @@ class FistaTv(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Those for the weight."""
+        """Sweeps of the trials that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -81,7 +81,7 @@ class FistaTv(VoxelMethod):
     def with_weight(
         self, problem: VoxelProblem, x: F32, trial: Callable[[], HeldOutTrial | None] | None = None
     ) -> tuple[F32, NoiseBalance | float]:
-        """`iterate`, and the weight μ; `trial`: as of `choose_weight`."""
+        """The volume after the iterations, and the weight μ; `trial`: as of `choose_weight`."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
@@ -139,7 +139,7 @@ class OsSirtTv(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Those for the weight."""
+        """Sweeps of the trials that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -203,7 +203,7 @@ class PnpDct(VoxelMethod):
 
     @property
     def trial_sweeps(self) -> int:
-        """Those for the weight of total variation, those of a first volume, and steps with four thresholds."""
+        """Sweeps for the weight of total variation and a first volume, and steps with four thresholds."""
         return CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * TRIAL_STEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
@@ -245,7 +245,7 @@ class PnpDct(VoxelMethod):
 
 
 class Patches(NamedTuple):
-    """What views held out tell of sparse patches.
+    """Sparse patches as views held out prefer them.
 
     Attributes:
         strength: of `pnp_dct`.
@@ -275,7 +275,7 @@ def choose_patches(
         found = preferred_strength(partial(residuals_of_patches, judge, smooth), first)
         if found is None:
             return [first, 0]
-        judge.keep("patches", found)
+        judge.remember("patches", found)
         return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
 
     strength, better = problem.decide("strength", chosen)
@@ -283,9 +283,11 @@ def choose_patches(
 
 
 def residuals_of_patches(trial: HeldOutTrial, x: F32, strength: float) -> F64:
-    """What the volume that patches make of this one leaves of the views held out."""
+    """Residuals of views held out by the volume that patches make of `x`."""
 
     def made(strength: float) -> F32:
-        return trial.made(lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x)
+        return trial.volume_by(
+            lambda part, first: pnp_dct(part, first, TRIAL_THRESHOLD * strength, steps=TRIAL_STEPS), x
+        )
 
     return trial.residuals_of("patches", strength, made)

@@ -37,7 +37,7 @@ _LEAST_SPEED = 1.0  # pixels a view: what stands is at one place
 
 @dataclass(frozen=True)
 class OddView:
-    """A view that differs from the volume in a part.
+    """A part of a view that differs from the volume.
 
     Attributes:
         view: index in the projections.
@@ -75,7 +75,7 @@ def on_a_line(parts: Sequence[OddView]) -> tuple[OddView, ...]:
 
 
 def speed_of(parts: Sequence[OddView]) -> float:
-    """Pixels a view, to the right, by least squares."""
+    """Speed in pixels a view, to the right, by least squares."""
     return float(np.polyfit([odd.view for odd in parts], [_middle(odd) for odd in parts], 1)[0])
 
 

@@ -75,7 +75,7 @@ class NoiseBalance:
 
     @classmethod
     def of(cls, problem: VoxelProblem, start: F32, sweeps: int, evenly: bool = True) -> NoiseBalance:
-        """For a problem that starts from the volume `start` [y, x, z], not zero.
+        """The weight for a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
             sweeps: of the method.
@@ -137,7 +137,7 @@ class Subsets:
 
     @classmethod
     def of(cls, problem: VoxelProblem, most: int, fewest: int = 1) -> Subsets:
-        """At most so many; see `subsets_of`."""
+        """At most `most` subsets of the views; see `subsets_of`."""
         projector, weight = problem.projector, problem.weight
         count, heaviest = subsets_of(projector.geometry, most, fewest), 0
         views = interleaved(projector, count)

@@ -68,7 +68,7 @@ class ViewResolution:
         return cls(np.abs(axes[:, :2]) * edges[:, None], interpolation, views, geometry.is_cone)
 
     def select(self, views: NDArray[np.intp]) -> ViewResolution:
-        """Of these views, in their order."""
+        """The resolution of these views, in their order."""
         return replace(self, voxels=self.voxels[views], interpolation=self.interpolation[views])
 
     @property

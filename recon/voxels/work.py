@@ -36,7 +36,7 @@ def beam_of(geometry: Geometry, grid: Grid) -> str:
 
 
 def sweep(geometry: Geometry, grid: Grid) -> Work:
-    """A projection of all views and its adjoint.
+    """Work of a projection of all views and its adjoint.
 
     Raises:
         ValueError: no projector takes these views.
@@ -54,21 +54,21 @@ def on_volume(operation: str, grid: Grid, times: float = 1.0) -> Work:
 
 
 def power_rounds(geometry: Geometry, grid: Grid, subsets: int = 1) -> Work:
-    """`largest_eigenvalue` of a subset of the views, rays all alike."""
+    """Work of `largest_eigenvalue` of a subset of the views, all rays alike."""
     rows = min(POWER_ROWS, grid.shape[0]) if geometry.rows_show_slices else grid.shape[0]
     some = replace(grid, shape=(rows, *grid.shape[1:]))
     return sweep(geometry, some) * (POWER_ROUNDS / subsets)
 
 
 def fista_sweeps(geometry: Geometry, grid: Grid, sweeps: float, subsets: int, tv_steps: int, fewest: int = 1) -> Work:
-    """Sweeps of `ordered_fista`; subsets as of `subsets_of`."""
+    """Work of sweeps of `ordered_fista`; subsets as of `subsets_of`."""
     count = subsets_of(geometry, subsets, fewest)
     step = on_volume("pass", grid, 1 + _PASSES_AHEAD) + on_volume("tv", grid, tv_steps + 1)
     return sweeps * (sweep(geometry, grid) + count * step)
 
 
 def ordered_sweeps(geometry: Geometry, grid: Grid, sweeps: float, subsets: int) -> Work:
-    """Sweeps of `Sweeps`, with those for the sums before the first one."""
+    """Work of passes over ordered subsets, with those for the sums before the first one."""
     if subsets >= geometry.n_views:
         work = sweep(geometry, grid)
         return (sweeps + 1) * Work({f"single {name}": amounts for name, amounts in work.amounts.items()})
@@ -76,7 +76,7 @@ def ordered_sweeps(geometry: Geometry, grid: Grid, sweeps: float, subsets: int) 
 
 
 def patch_steps(geometry: Geometry, grid: Grid, steps: int) -> Work:
-    """Steps of `pnp_dct`."""
+    """Work of steps of `pnp_dct`."""
     rounds = -(-steps // STEPS)
     towards = sweep(geometry, grid) + on_volume("pass", grid, 2)
     return steps * towards + on_volume("patches", grid, rounds + 1) + power_rounds(geometry, grid)
@@ -98,7 +98,7 @@ def trial_part(geometry: Geometry, grid: Grid, rows: int = TRIAL_ROWS) -> tuple[
 
 
 def weight_choice(geometry: Geometry, grid: Grid) -> Work:
-    """`choose_weight`: of FBP and its noise, and of as many trials as there are as a rule."""
+    """Work of `choose_weight`: FBP, its noise, and the usual number of trials."""
     first = direct_work(geometry, grid) + on_volume("slope", grid)
     part = trial_part(geometry, grid)
     if part is None:
@@ -108,7 +108,7 @@ def weight_choice(geometry: Geometry, grid: Grid) -> Work:
 
 
 def patch_choice(geometry: Geometry, grid: Grid) -> Work:
-    """`choose_patches`: of the noise of a volume, and of as many trials as there are as a rule."""
+    """Work of `choose_patches`: the noise of a volume, and the usual number of trials."""
     noise = power_rounds(geometry, grid) + STEPS * (sweep(geometry, grid) + on_volume("pass", grid, 2))
     part = trial_part(geometry, grid)
     if part is None:

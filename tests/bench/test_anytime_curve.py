@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import recon
-from beamline.plan.angles import fixed, golden, interlaced
+from beamline.plan.plan import fixed, golden, interlaced
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem

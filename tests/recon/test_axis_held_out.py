@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisError
 from recon.voxels.projector import Projector
+from tests.slow_cases import others_slow
 
 VIEWS, ROWS, COLS, SOD, SDD = 36, 6, 64, 60.0, 90.0
 BALLS = np.array([[9.0, -4.0, 1.0, 5.0], [-7.0, 6.0, -2.0, 4.0], [-2.0, -10.0, 0.0, 3.0]])  # x, y, z, radius in mm
@@ -35,7 +36,7 @@ def _views(axis_col: float, sod: float, sdd: float) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize(("sod", "sdd"), [(SOD, SDD), (1e5, 1e5)], ids=["cone", "nearly parallel"])
-@pytest.mark.parametrize(("start", "noise"), [(31.5, 0.3), (24.0, 0.3), (24.0, 0.0)])
+@pytest.mark.parametrize(("start", "noise"), others_slow([(24.0, 0.3), (31.5, 0.3), (24.0, 0.0)]))
 def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start: float, noise: float) -> None:
     views = _views(29.2, sod, sdd) + np.random.default_rng(1).normal(0, noise, (VIEWS, ROWS, COLS)).astype(np.float32)
     found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, axis_col=start))
@@ -43,6 +44,7 @@ def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start:
     assert abs(found.candidates[found.curve.argmin()] - 29.2) <= 1
 
 
+@pytest.mark.slow
 def test_the_axis_of_a_sample_wider_than_the_field() -> None:
     """Foam in 86 columns, seen in 80 of them. The field alone has no room for the rest, and each axis looks alike."""
     rng, rows, n = np.random.default_rng(1), 12, 96
@@ -56,7 +58,7 @@ def test_the_axis_of_a_sample_wider_than_the_field() -> None:
     assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
-@pytest.mark.parametrize("dark", [64, 72])
+@pytest.mark.parametrize("dark", others_slow([64, 72]))
 def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
     """To half a column: the dark part counts as not measured; its pixels hold a wall."""
     n = 96
@@ -73,6 +75,7 @@ def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
     assert found.value == pytest.approx(48.6, abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> None:
     """Also where it is so far from the axis that the candidates beside it leave nearly as much."""
     views, told = _views(29.2, SOD, SDD), list[int]()
@@ -85,6 +88,7 @@ def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> 
         assert not axis_by_views(views, replace(right, axis_col=59.2), near=True).confident
 
 
+@pytest.mark.slow
 def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
     with pytest.raises(AxisError, match=r"12 columns.*best with column"):
         axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=50.0))

@@ -21,6 +21,7 @@ AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
 GRID = recon.Grid((28, 32, 32), 0.04)
 ANGLES = np.arange(32) * 2 * np.pi / 32
 # Their rays are those of r2, naf and fista-tv.
+QUICK = "fbp", "cgls", "fista-tv"
 CONES = "r2", "fbp", "sirt"  # whose rays of a cone are those of the others
 LIKE_OTHERS = "r2-published", "sax-nerf", "intratomo", "series", "materials"
 SHORT = {
@@ -55,7 +56,11 @@ def error(volume: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("name", "cone"),
     [
-        pytest.param(name, cone, marks=[pytest.mark.slow] * (name == "naf" or (cone and name not in CONES)))
+        pytest.param(
+            name,
+            cone,
+            marks=[pytest.mark.slow] * (name not in QUICK or (cone and name not in CONES)),
+        )
         for name in methods.names()
         if name not in LIKE_OTHERS
         for cone in (False, True)

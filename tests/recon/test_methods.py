@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import recon
 from recon import methods
 from recon.base.method import Method, Traits
-from recon.splatting.fit_method import StreamingMethod
+from recon.splatting.fit_method import FitMethod
 from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
 
@@ -77,7 +77,7 @@ def test_registry_entries_match_their_classes(name: str) -> None:
     method = methods.by_name(name)
     assert method.name == name and method.label
     assert is_dataclass(method) and getattr(recon, method.__name__) is method
-    assert methods.streams(name) is isinstance(method(), StreamingMethod)
+    assert methods.streams(name) is isinstance(method(), FitMethod)
 
 
 def test_settings_are_built_by_name() -> None:
@@ -138,7 +138,13 @@ def test_the_protocol_is_met_by_every_method() -> None:
 class TestConformance(MethodConformance):
     """Ours pass the suite that is shipped."""
 
-    @pytest.fixture(params=[*methods.names(), "auto"])
+    @pytest.fixture(
+        params=[
+            pytest.param(name, marks=[pytest.mark.slow] * entry.module.startswith("recon.features"))
+            for name, entry in methods.METHODS.items()
+        ]
+        + ["auto"]
+    )
     def method(self, request: pytest.FixtureRequest) -> Method:
         fit = recon.R2(steps=40, gaussians=200, finish=2)
         if request.param == "auto":

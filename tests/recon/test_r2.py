@@ -19,6 +19,7 @@ from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
+from tests.slow_cases import others_slow
 
 
 def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> None:
@@ -30,6 +31,7 @@ def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> Non
     assert second.settings["kernel"] is other and second.gaussians is not None and second.gaussians.kernel is other
 
 
+@pytest.mark.slow
 def test_matter_beyond_the_default_grid_is_explained() -> None:
     # A full turn with the axis near the edge: the detector sees a sample wider than itself.
     sample = Phantom.of((Cylinder(2.6, 1.6, 0.2), Ellipsoid((0.5, 0.4, 0.4), 0.6, centre=(-0.6, 0.4, 0.1))))
@@ -123,7 +125,7 @@ def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
-@pytest.mark.parametrize("weight", [1e-20, 1e-3, 1e20])
+@pytest.mark.parametrize("weight", others_slow([1e-20, 1e-3, 1e20]))
 def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
     alone, weighed = (
         recon.reconstruct(noisy, VIEWS, R2(steps=30, gaussians=400), use=DataUse(weights=w)).volume.data
@@ -177,6 +179,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
     assert psnr(truth, likely) > psnr(truth, squares) - 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["fbp", pytest.param("tv", marks=pytest.mark.slow)])
 def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.initialise.Start) -> None:
     # Data of the voxel projector: nothing of the fit's own formulas.

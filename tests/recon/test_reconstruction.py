@@ -24,6 +24,7 @@ from recon.methods import build, by_name, names_of_one_volume
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
+from tests.slow_cases import others_slow
 
 
 def test_few_noisy_views_beat_fbp(phantom: Phantom, noisy: np.ndarray) -> None:
@@ -226,7 +227,7 @@ def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> No
         lambda light: recon.reconstruct(light, VIEWS, "fbp"),
         lambda light: recon.find_axis(light, ANGLES),
         lambda light: recon.remove_rings(light, ANGLES),
-        lambda light: axis_by_views(light, VIEWS),
+        pytest.param(lambda light: axis_by_views(light, VIEWS), marks=pytest.mark.slow),
     ],
 )
 def test_transmission_causes_a_warning_with_advice(noisy: np.ndarray, call: Callable[[np.ndarray], object]) -> None:
@@ -308,7 +309,7 @@ def test_a_result_is_saved_as_a_whole_and_nothing_is_overwritten(noisy: np.ndarr
     assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]
 
 
-@pytest.mark.parametrize("method", [recon.FistaTv(), recon.R2(steps=150)])
+@pytest.mark.parametrize("method", others_slow([recon.FistaTv(), recon.R2(steps=150)]))
 def test_a_helical_scan_is_a_height_a_view(method: recon.Method) -> None:
     """A ball higher than the detector, in two turns; without its heights it is a smear."""
     heights = np.column_stack((np.zeros(60), np.linspace(-8, 8, 60)))

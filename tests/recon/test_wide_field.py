@@ -13,6 +13,7 @@ from recon.prep.align import AxisError, axis_from_opposites
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
+from tests.slow_cases import others_slow
 
 MATTER, RADIUS, COLS, AXIS = 0.02, 46.0, 70, 21.3
 TURN = np.linspace(0, 2 * np.pi, 180, endpoint=False)
@@ -101,7 +102,7 @@ def wide_field(overlap: float, photons: float, seed: int, cols: int = 120) -> tu
     return -np.log(light / photons).astype(np.float32), axis
 
 
-@pytest.mark.parametrize("overlap", [0.05, 0.066, 0.1, 0.2, 0.3])
+@pytest.mark.parametrize("overlap", others_slow([0.05, 0.1, 0.066, 0.2, 0.3], 2))
 @pytest.mark.parametrize("photons", [1e4, 3e5])
 def test_the_axis_of_a_half_acquisition_is_found_with_little_overlap(overlap: float, photons: float) -> None:
     views, axis = wide_field(overlap, photons, round(100 * overlap))
@@ -110,7 +111,7 @@ def test_the_axis_of_a_half_acquisition_is_found_with_little_overlap(overlap: fl
     assert estimate.confident
 
 
-@pytest.mark.parametrize("overlap", [0.01, 0.02, 0.03, 0.05])
+@pytest.mark.parametrize("overlap", others_slow([0.01, 0.03, 0.02, 0.05], 2))
 @pytest.mark.parametrize("photons", [30.0, 300.0])
 def test_an_axis_that_is_called_certain_is_right(overlap: float, photons: float) -> None:
     """Where noise or a lack of overlap hides the axis, what is found is not called certain."""

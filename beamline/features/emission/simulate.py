@@ -20,8 +20,7 @@ from beamline.core.sinks import fan_out
 from beamline.core.text import size
 from beamline.core.voxel_kind import VoxelKind
 from beamline.scenes.request import Output, SimulateRequest
-from beamline.scenes.scene_file import open_other
-from beamline.scenes.truth import Truth, grid_of, write_truth
+from beamline.scenes.scene_file import Truth, grid_of, open_other, write_truth
 from beamline.storage import hdf5
 from drivers.base.clock import SystemClock
 from simulators.scenes.emission.counts import EmissionScene, Events, events, load_emission

@@ -7,10 +7,10 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.refusals import checked_views
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.step import StepDone, options_of
+from beamline.projections.views import checked_views
 from beamline.storage.readers.base import EmissionOf, ScanSource
 from recon.prep.correct import Projections
 from recon.prep.counts import Emission, weighted_lines

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
 from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
+from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
 from beamline.cli.selection_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
@@ -20,7 +20,7 @@ from beamline.core.text import count, printable
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.projections.returned import ReturnedView
+    from beamline.projections.flagged_frames import ReturnedView
     from beamline.projections.scan_statistics import LightAsked
     from beamline.storage.readers.open import SourceOptions
 
@@ -99,7 +99,7 @@ def info(
 
 def _returned(scan: SourceOptions) -> list[ReturnedView]:
     from beamline.features.files.describe import LOOK
-    from beamline.projections.returned import returned_views
+    from beamline.projections.flagged_frames import returned_views
     from beamline.storage.readers.base import LookedEnoughError
     from beamline.storage.readers.open import open_scan
     from beamline.storage.readers.wrapped import BriefSource

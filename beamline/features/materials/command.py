@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import DATA, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import dry_option, json_option, names_in, option, refuse_shared
-from beamline.cli.recipe import repeating
+from beamline.cli.recipe import DATA, OUTPUT, RESOURCES, Grouped, heading, repeating
 from beamline.cli.recon import dry_run, run_reconstruction
 from beamline.cli.recon_options import memory_option, report_option, unfinished_option
 from beamline.cli.selection_options import chosen, selection_options

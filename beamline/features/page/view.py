@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
+from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
 from beamline.cli.selection_options import scan_options
 from beamline.core.errors import DataError
 from beamline.features.page.watch import bind_option, port_option, serve_shown

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.options import WholeRange, say
-from beamline.cli.page_beside import ACT, ENDS_WITHIN, LOOK
+from beamline.cli.terminal import ACT, ENDS_WITHIN, LOOK
 from beamline.core.files import RUNS
 from beamline.core.process import at_end_of
 

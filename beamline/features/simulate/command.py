@@ -114,7 +114,7 @@ def _explain(scan: Scan, output: Output) -> None:
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: Output) -> dict[str, object]:
-    from beamline.scenes.truth import binning_of, memory_of, truth_of, write_truth
+    from beamline.scenes.scene_file import binning_of, memory_of, truth_of, write_truth
 
     n = binning or binning_of(scan.detector)
     try:

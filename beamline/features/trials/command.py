@@ -12,7 +12,6 @@ from typing import Any, get_args
 import click
 
 from beamline.cli.method_options import equal_time, row_options, row_settings
-from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import (
     POSITIVE,
     MethodChoice,
@@ -31,7 +30,7 @@ from beamline.cli.options import (
     unknown_method,
     with_request,
 )
-from beamline.cli.recipe import names_given, repeating
+from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
 from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped

@@ -15,7 +15,7 @@ from beamline.features.trials.trial import Outcome
 from beamline.projections.scan_statistics import Light
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from recon.assess.time_model import duration_text
 
 

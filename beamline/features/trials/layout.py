@@ -19,7 +19,7 @@ from beamline.core.shipped import version
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.report.html import Picture, render
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 
 _WIDTH = 120  # characters
 

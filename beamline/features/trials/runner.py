@@ -28,7 +28,7 @@ from beamline.projections.scan_statistics import Light, LightAsked, light_in
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.outcome import facts_of
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
 from recon.assess import metrics

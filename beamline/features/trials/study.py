@@ -25,7 +25,7 @@ from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
 from beamline.report.html import Picture
 from beamline.report.metrics import METRICS, Metric
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from drivers.base.clock import Clock
 from recon.base.choices import Filter
 from recon.base.method import Plain

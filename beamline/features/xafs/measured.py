@@ -113,7 +113,7 @@ def read_table(path: Path, unit: str | None) -> XafsCurve:
     try:
         lines = text_in(path).splitlines()
     except OSError as error:
-        raise DataError(f"{path} cannot be read ({error}).") from error
+        raise DataError(f"{path} cannot be read ({error.strerror or error}).") from error
     rows = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or re.match(r"\s*(?!(?:nan|inf)\b)[#%A-Za-z\"]", line, re.IGNORECASE):

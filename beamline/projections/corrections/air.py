@@ -179,16 +179,15 @@ def without_background(
     Raises:
         DataError: polynomials were asked for, and too few rays miss the sample.
     """
-    from beamline.projections.truncation import cut_sides
     from recon.base.noise import noise_level
+    from recon.voxels.field_edges import FieldEdges
 
     if surface == "none":
         return "", None
     order = None if surface == "auto" else surface
     views = _Views(data, geometry, unknown)
-    shows_air = _see_all_sides(geometry) and not cut_sides(
-        data, geometry
-    )  # a sample that fills the field looks like air
+    fills_field = FieldEdges.of(data, geometry).beyond()  # such a sample looks like air
+    shows_air = _see_all_sides(geometry) and not fills_field
     fitted, where = _fitted(views, order) if shows_air else (None, None)
     if fitted is None or where is None:
         if order is None:

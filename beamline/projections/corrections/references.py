@@ -130,13 +130,6 @@ def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDA
     return np.where(np.isfinite(values), np.median(views) / values, 1.0)
 
 
-def view_scale(source: ScanSource, by_current: bool) -> NDArray[np.float64] | None:
-    """`light_scale` of views; None where they are all exposed alike, and nobody asked for the ring current."""
-    from beamline.storage.rules.exposures import views_differ
-
-    return light_scale(source, by_current) if by_current or views_differ(source) else None
-
-
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own ring current to the median of the projections'.
 

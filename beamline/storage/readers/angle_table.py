@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in
-from beamline.plan.angles import from_text
+from beamline.plan.plan import from_text
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind

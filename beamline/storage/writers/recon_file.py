@@ -168,6 +168,8 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
     Raises:
         DataError: if the file is missing or is not such a file, or `at` names none of its volumes.
     """
+    if not path.is_file():
+        raise DataError(f"{path} is not there.")
     with ExitStack() as stack:
         try:
             file = stack.enter_context(opened_whole(path))

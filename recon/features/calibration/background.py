@@ -188,7 +188,7 @@ class _Views:
         return self.select(seen), self.select(unseen)
 
     def less(self, coefficients: F64) -> F32:
-        """The data less the background."""
+        """The data minus the background."""
         return np.asarray(self.data - np.tensordot(coefficients.astype(np.float32), self.terms, 1))
 
     def without_volume(self, images: F32, inside: F32 | None = None) -> F64:
@@ -221,7 +221,7 @@ class _Views:
 
 
 class _Trial:
-    """A volume of views less some background."""
+    """A volume of the views minus a background."""
 
     def __init__(self, views: _Views, coefficients: F64, volume: Volume | None = None) -> None:
         self.views, self.coefficients, self.volume = views, coefficients, volume
@@ -235,13 +235,13 @@ class _Trial:
         return np.asarray(data - views.projector.forward(self.volume.data))
 
     def errors(self, unseen: _Views) -> F64:
-        """[view] mean square that volume and background leave of views held out."""
+        """[view] mean square residual of views held out, by volume and background."""
         assert self.volume is not None
         left = unseen.less(self.coefficients) - unseen.projector.forward(self.volume.data)
         return np.asarray(np.average(np.square(left, dtype=np.float64), axis=(1, 2), weights=unseen.weight))
 
     def beats(self, other: _Trial, unseen: _Views, share: float) -> bool:
-        """It leaves less than a share of what another leaves of views held out, and its background is large enough."""
+        """Whether its residual of views held out is below a share of another's, and its background large enough."""
         ours, theirs = self.errors(unseen), other.errors(unseen)
         change = np.tensordot(self.coefficients - other.coefficients, self.views.terms, 1)
         large = float(np.sqrt(np.mean(np.square(change)))) >= LEAST_SIZE

@@ -20,7 +20,8 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import AT_AXIS, NARROWEST, ring_offsets, steadiness
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out import beyond_chance, busiest_rows, split_views
+from recon.voxels.field_edges import busiest_rows
+from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
@@ -161,7 +162,7 @@ class _Band:
         return volume, gains_so_far
 
     def errors(self, volume: Volume, gains: F32, unseen: NDArray[np.intp], rows: slice) -> F64:
-        """[view] mean square that volume and gains leave of views held out, in some rows."""
+        """[view] mean square residual of views held out, by volume and gains, in some rows."""
         left = self.data[unseen] - gains - Projector(self.geometry.select(unseen), volume.grid).forward(volume.data)
         known = None if self.known is None else np.broadcast_to(self.known, left.shape)[:, rows]
         return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))

@@ -58,7 +58,7 @@ class GeometryChange:
         )
 
     def of(self, terms: frozenset[str]) -> GeometryChange:
-        """The part of it that these terms name."""
+        """The change of these terms only."""
         return GeometryChange(
             self.axis * ("axis" in terms), self.roll * ("roll" in terms), self.tilt * ("tilt" in terms),
             self.shifts * ("shifts" in terms),
@@ -69,7 +69,7 @@ class GeometryChange:
         return replace(self, axis=self.axis * factor, shifts=self.shifts * factor)
 
     def applied(self, geometry: Geometry) -> Geometry:
-        """The geometry after it."""
+        """The geometry with this change applied."""
         return replace(
             geometry,
             axis_col=geometry.axis_col + self.axis,
@@ -148,7 +148,7 @@ class JointFit:
     Attributes:
         data: [view, col, row], line integrals.
         known: [view, col, row] weights of rays; None: one for all.
-        terms: of `freedom.TERMS`, which may change.
+        terms: of `TERMS`, which may change.
         volume: the best so far.
         turned: the data as a detector without roll would have taken them.
     """
@@ -168,13 +168,13 @@ class JointFit:
 
     @classmethod
     def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None) -> JointFit:
-        """Of views [view, row, col]."""
+        """The fit of views [view, row, col]."""
         tall = taller(Grid.matching(geometry))
         rays = None if known is None else projection_lines(known)
         return cls(projection_lines(data), geometry, terms, tall, rays)
 
     def weighed(self, images: F32) -> F32:
-        """W images."""
+        """Images times W, see the module."""
         if self.known is None:
             return _ramp(images)
         return self.known * _ramp(self.known * images)

@@ -17,12 +17,10 @@ from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
-from recon.voxels.held_out import beyond_chance
+from recon.voxels.held_out import beyond_chance, predicted_views
 from recon.voxels.methods import FistaTv
-from recon.voxels.projector import Projector
 
 _ONE_IN = 4  # views held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
@@ -34,7 +32,7 @@ _SURE = 2.0  # see `beyond_chance`
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """Deviations of views held out.
+    """Measures how well a geometry predicts views held out.
 
     Attributes:
         views: float32 [view, row, col], line integrals.
@@ -49,17 +47,9 @@ class Judge:
     placed: bool
 
     def deviations(self, geometry: Geometry) -> F64:
-        """[view held out] root mean squares by a volume of the others in this geometry."""
-        order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
-        unseen = order[1::_ONE_IN]
-        rows = geometry.detector_shape[0]
-        seen = np.setdiff1d(order, unseen)
-        use = DataUse()
-        if self.known is not None:
-            use = DataUse(np.broadcast_to(self.known, self.views[seen].shape).copy())
-        problem = ReconProblem(self.views[seen], geometry.select(seen), self.grid, use, 0, "cpu")
-        volume = FistaTv(_SWEEPS, _TV_WEIGHT).run(problem, RunControl()).volume
-        images = Projector(geometry.select(unseen), self.grid).forward(volume.data)
+        """[view held out] root mean square residual, by a volume of the others in this geometry."""
+        method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
+        unseen, images = predicted_views(method, self.views, geometry, self.grid, self.known, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
         edge = min(_EDGE, (rows - 1) // 4)
         known[:edge], known[rows - edge :] = 0, 0
@@ -100,7 +90,7 @@ _NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller change
 
 @dataclass(frozen=True, eq=False)
 class LearntGeometry:
-    """What was learnt of a geometry.
+    """The learnt change of a geometry, as far as it is confirmed.
 
     Attributes:
         change: in pixels of the views; what was not confirmed is zero.
@@ -115,7 +105,7 @@ class LearntGeometry:
     after: float
 
     def in_words(self, binning: int = 1) -> str:
-        """In a sentence, in pixels smaller by `binning`."""
+        """The result as a sentence, in pixels smaller by `binning`."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: the views show no error of it that matters; it is left as it was."
@@ -126,7 +116,7 @@ class LearntGeometry:
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
-        """For the file of a volume, by name; pixels smaller by `binning`."""
+        """Values for the file of a volume, by name, in pixels smaller by `binning`."""
         return {
             "calibrate_confirmed": ",".join(self.confirmed) or "none",
             "calibrate_axis_change_px": self.change.axis * binning,
@@ -148,7 +138,7 @@ def learn_geometry(
 
     Args:
         projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
-        terms: what may change, of `freedom.TERMS`.
+        terms: what may change, of `joint.TERMS`.
         progress: steps done, and steps at most.
         known: [row, col] weights of pixels; None: one for all.
 

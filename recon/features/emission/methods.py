@@ -97,7 +97,7 @@ class _Pass(NamedTuple):
 
 
 def _passes(emission: Emission, grid: Grid, subsets: int) -> Iterator[_Pass]:
-    """The passes of `mlem`, without end."""
+    """Endless passes of `mlem`."""
     parts = _subsets(emission, grid, subsets)
     most = max(float(part.sensitivity.max()) for part in parts)
     if most == 0:
@@ -216,7 +216,7 @@ _FLOOR = 1e-6  # of the mean line integral
 
 @dataclass(frozen=True)
 class Mlem(Checked):
-    """See `likelihood.mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
+    """See `mlem`; one iteration after the other raises the likelihood. No voxel is below 0.
 
     Line integrals that come without counts are taken for counts with their weights as survival.
 
@@ -232,12 +232,12 @@ class Mlem(Checked):
     iterations: Count | None = None
 
     def parts(self, views: int) -> int:
-        """Subsets of so many views."""
+        """Number of subsets of so many views."""
         return 1
 
     @property
     def most_iterations(self) -> int:
-        """As many as counts held out may ask for."""
+        """Largest number of iterations that counts held out may choose."""
         return UPDATES // self.parts(UPDATES)
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -267,7 +267,7 @@ class Mlem(Checked):
         return replace(self, iterations=1)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """At most: counts held out may ask for fewer iterations, after as many trials on halves of them."""
+        """The most work: counts held out may choose fewer iterations, after as many trials on halves of them."""
         iterations = self.most_iterations if self.iterations is None else self.iterations
         step = sweep(geometry, grid) + on_volume("pass", grid, 6 * self.parts(geometry.n_views))
         return Costs({self.name: (iterations + 0.5) * step})
@@ -291,7 +291,7 @@ class Osem(Mlem):
 
 
 def _emission(problem: ReconProblem) -> Emission:
-    """What was counted, less the lines that weigh nothing."""
+    """The counts, without lines of weight 0."""
     given, weights = problem.use.emission, problem.use.weights
     if given is None:
         lines, survival_of_lines = masked(problem.projections, weights)

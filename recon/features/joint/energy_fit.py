@@ -18,7 +18,7 @@ from recon.base.volume import Grid
 from recon.features.joint.motion import Motion, moved, moved_back, weighed
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.held_out import busiest_rows, slab_of
+from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.voxel_problem import Momentum, TotalVariationProx, difference_weights, largest_eigenvalue
@@ -178,12 +178,12 @@ class EnergyFit:
         self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
 
     def move(self, motion: Motion) -> None:
-        """Let the volume move so from here on."""
+        """Use this motion of the volume from here on."""
         self.motion = motion
         self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
 
     def _curvature(self, subset: list[_Part]) -> float:
-        """As `largest_eigenvalue`, of a volume that moves."""
+        """`largest_eigenvalue` for a volume that moves."""
         x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
         for _ in range(_ROUNDS):
             product = np.zeros_like(x)
@@ -252,7 +252,7 @@ class EnergyFit:
                 ahead(self.z)
 
     def residual_of(self, densities: F32) -> float:
-        """What densities [material, z, y, x] leave of all views, over the norm of the views."""
+        """Residual of all views by densities [material, z, y, x], over the norm of the views."""
         self.z = np.ascontiguousarray(np.einsum("km,mzyx->kyxz", self._to.astype(np.float32), densities))
         out = np.empty_like(self.z)
         return math.sqrt(sum(self.descent(subset, out) for subset in self.subsets)) / self._norm
@@ -266,7 +266,7 @@ class EnergyFit:
         return float(np.abs(total).max())
 
     def densities(self) -> F32:
-        """[material, z, y, x]."""
+        """The densities [material, z, y, x]."""
         return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
 
 

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.declared_types import check_arguments
+from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.motion import Motion, Seen, improved, moved, weighed
 from recon.voxels.displacement import Displacement, displaced, displacements, judge, measured_unmagnified, unmagnified
-from recon.voxels.held_out import busiest_rows
+from recon.voxels.field_edges import busiest_rows
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 
 _COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
@@ -43,7 +44,7 @@ def levels(cols: int) -> list[tuple[int, int]]:
 
 
 def motion_sweeps(cols: int) -> int:
-    """Of `learnt_motion`."""
+    """Number of sweeps of `learnt_motion`."""
     return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
 
 
@@ -101,7 +102,7 @@ def unseen_squares(
 
 
 def _squares_left(views: EnergyViews, densities: F32, motion: Motion | None, grid: Grid) -> F64:
-    """[view] weighed squares of what densities [knot, z, y, x] leave."""
+    """[view] weighted squared residual by densities [knot, z, y, x]."""
     projector, data = Projector(views.geometry, grid), projection_lines(views.projections)
     weight = None if views.weight is None else projection_lines(views.weight)
     squares = np.empty(len(data))
@@ -226,7 +227,7 @@ def register_energies(
 
 
 def _unmagnified(views: EnergyViews, moves: Sequence[Displacement], centre: tuple[float, float]) -> EnergyViews:
-    """All views in the magnification of the reference; pixels that were not measured weigh nothing."""
+    """All views at the magnification of the reference; pixels that were not measured weigh nothing."""
     if all(move.magnification == 1 for move in moves):
         return views
     data, weight = views.projections.copy(), np.ones_like(views.projections)
@@ -252,4 +253,4 @@ def _strengths(views: EnergyViews) -> F64:
 def _spread(energy: NDArray[np.intp]) -> NDArray[np.intp]:
     """Indices of views that are evenly spread, at most `_VIEWS` of each energy."""
     own = (np.flatnonzero(energy == e) for e in np.unique(energy))
-    return np.sort(np.concatenate([at[np.unique(np.linspace(0, at.size - 1, _VIEWS).astype(int))] for at in own]))
+    return np.sort(np.concatenate([spread(at, _VIEWS) for at in own]))

@@ -207,40 +207,34 @@ class _History:
         self.began = self.control.now()
 
     def heard(self, sweep: int, residual: float) -> bool:
-        """As `fit_series` and `fit_materials` call their `go_on`."""
+        """The `go_on` of `fit_series` and `fit_materials`."""
         if sweep > 0:
             self.tell(sweep, residual)
         else:
             self.tried += 1
-            self._tell(_progress(self.tried, self.tried - sweep, "trial sweeps"))
+            self.control.tell_part(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
             self.tried = 0 if sweep == 0 else self.tried
         return not self.control.stop()
 
     def heard_share(self, steps_to_come: int) -> bool:
-        """As `fit_share` calls its `go_on`."""
-        self._tell(_progress(STEPS - steps_to_come, STEPS, "steps of the share"))
+        """The `go_on` of `fit_share`."""
+        self.control.tell_part(STEPS - steps_to_come, STEPS, self.began, self.n_views, "steps of the share")
         return not self.control.stop()
 
     def tell(self, sweep: int, residual: float) -> None:
-        """Of a sweep of the fit."""
-        self.of_sweeps = (*self.of_sweeps, self._tell(Progress(sweep, self.sweeps, math.nan, residual, residual, 0, 0)))
-
-    def _tell(self, reached: Progress) -> Progress:
-        now = replace(reached, seconds=self.control.now() - self.began, n_views=self.n_views)
-        self.control.tell(now)
-        return now
+        """Record and report a sweep of the fit."""
+        seconds = self.control.now() - self.began
+        reached = Progress(sweep, self.sweeps, seconds, residual, residual, 0, self.n_views)
+        self.of_sweeps = (*self.of_sweeps, reached)
+        self.control.tell(reached)
 
     def result(
         self, series: VolumeSeries, grid: Grid, settings: dict[str, Any], at: Callable[[float], F32]
     ) -> Reconstruction:
-        """The volumes with this history."""
+        """The reconstruction with this history."""
         if not self.of_sweeps:  # it was stopped before
             self.tell(0, series.residual)
         return Reconstruction(Volume(series.data[0], grid), settings, self.of_sweeps, series=series, at=at)
-
-
-def _progress(n: int, of: int, unit: str) -> Progress:
-    return Progress(n, of, math.nan, math.nan, math.nan, 0, 0, unit=unit)
 
 
 def _require_own_grid(problem: ReconProblem) -> None:
@@ -249,7 +243,7 @@ def _require_own_grid(problem: ReconProblem) -> None:
 
 
 def _bytes_of(geometry: Geometry) -> int:
-    """Of all line integrals."""
+    """Bytes of all line integrals."""
     return 4 * geometry.n_views * math.prod(geometry.detector_shape)
 
 
@@ -270,7 +264,7 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
-    """How views held out chose whether matter moves, and what to try where they can hardly tell."""
+    """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
     judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
     if moves or moved >= still:
         return f"{'motion' if moves else 'no motion'}, as {judged}"

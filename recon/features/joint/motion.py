@@ -44,7 +44,7 @@ class Motion:
 
     @classmethod
     def none(cls, shape: tuple[int, int, int], times: F64, knots: int, controls: int) -> Motion:
-        """Of nothing, with so many knots in time, and control points along each axis."""
+        """No motion, with so many knots in time and control points along each axis."""
         return cls(shape, times, np.zeros((knots, 3, *(min(controls, n) for n in shape))))
 
     def on(self, shape: tuple[int, int, int], times: F64) -> Motion:

@@ -53,7 +53,7 @@ class Countdown:
         return self.going
 
     def end(self) -> None:
-        """No more may follow."""
+        """Tell the listener that no step follows."""
         if self.going and self.left > 0:
             self.left, self.going = 0, self.go_on(0)
 
@@ -81,7 +81,7 @@ class Proportions:
     stop: Callable[[], bool] = lambda: False
 
     def select(self, views: NDArray[np.intp]) -> Proportions:
-        """Some of the views."""
+        """The problem of some views."""
         return replace(
             self, projector=self.projector.subset(views), kind=self.kind[views], data=self.data[views],
             weight=self.weight[views],
@@ -100,7 +100,7 @@ class Proportions:
             yield kind
 
     def shown(self, factors: F32) -> F32:
-        """A f Σ c s."""
+        """Views [view, col, row] by these factors: A f Σ c s."""
         out = np.empty_like(self.data)
         for projector, own, shares in self._each_kind():
             out[own] = projector.forward_lines(self.matter * np.tensordot(shares.astype(np.float32), factors, 1))
@@ -244,7 +244,7 @@ def share_problem(views: EnergyViews, densities: F32, states: tuple[int, int], g
 
 
 def _even(problem: Proportions) -> F32:
-    """One share for all matter, the best in the mean of the views."""
+    """The one share for all matter that explains the mean of the views best."""
     one = problem.ones()
     all_explained = float(problem.explained(problem.shown(one)).sum(dtype=np.float64))
     mean = float(problem.explained(problem.data).sum(dtype=np.float64)) / (all_explained or 1)

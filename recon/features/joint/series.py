@@ -202,7 +202,7 @@ def _motion(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> tuple[Motion | None, tuple[float, float] | None]:
-    """How the sample moves, and what volumes without and with motion leave of views held out, where these chose."""
+    """The motion of the sample, and residuals of views held out without and with motion, where these chose."""
     unseen = None
     if wanted is None and (squares := unseen_squares(coarse, fine, go_on, stop)) is not None:
         wanted = _moves(*squares)
@@ -212,7 +212,7 @@ def _motion(
 
 
 def _moves(still: F64, moved: F64) -> bool:
-    """By squares [block] that volumes without and with motion leave of views held out."""
+    """Whether matter moves, by squared residuals [block] of views held out without and with motion."""
     return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
@@ -247,7 +247,7 @@ def smooth_factors(
     go_on: Callable[[int, float], bool],
     stop: Callable[[], bool],
 ) -> float | None:
-    """How smooth factors of the mean are best; None: volumes by themselves predict views held out as well.
+    """The best smoothness of factors of the mean; None: separate volumes predict views held out as well.
 
     Of some rows, from seven of eight views.
     """

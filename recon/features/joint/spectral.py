@@ -135,13 +135,13 @@ class _Trials:
         go_on: Callable[[int, float], bool],
         stop: Callable[[], bool],
     ) -> None:
-        """`fit` has the views of a trial, `judge` those held out."""
+        """Take the views of a trial (`fit`) and those held out (`judge`)."""
         self.going = True
         self._fit, self._judge, self._sweeps = fit, judge, sweeps
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """What a trial leaves of the views held out, infinite if it was ended; `after` it so many may follow."""
+        """Residual of the views held out, infinite if the trial was ended; `after` it so many trials may follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
@@ -167,7 +167,7 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """Of these weights times powers of the factor, the heaviest that predict as well; `weights` if ended."""
+        """The heaviest weights, times powers of the factor, that predict as well; `weights` if ended."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:

@@ -101,7 +101,7 @@ class IntraTomo(FieldMethod):
 
 
 def timed(which: str) -> tuple[SizedRun, ...]:
-    """Steps of the method of this name."""
+    """Timed runs of some steps of the method of this name."""
     from recon.machine_speed import views_of_disc
 
     geometry, grid, data = views_of_disc("parallel", 8, 64, 24)

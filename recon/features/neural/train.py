@@ -19,11 +19,11 @@ from recon.base.declared_types import Bound, Checked, Count, NonNegative, Positi
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.base.work import CLOCK, Costs, Work
 from recon.features.neural.networks import Field, Places, drawn, rays_of
 from recon.splatting.initialise import density_unit, first_volume
-from recon.splatting.train import used_and_kept_back
 from recon.voxels.direct import direct_work
 from recon.voxels.field_edges import wider_than_field
 from recon.voxels.voxel_problem import iterative_memory
@@ -95,7 +95,7 @@ class FieldMethod(Checked, ABC):
         return replace(self, seconds=None if self.seconds is None else of_time * self.seconds)
 
     def costs(self, geometry: Geometry, grid: Grid) -> Costs:
-        """At most: `seconds` may end it."""
+        """The most work: `seconds` may end the fit earlier."""
         if self.seconds is not None:
             return Costs({self.name: Work.of(CLOCK, self.seconds)})
         samples = self.steps * self.rays * self.samples_of(max(grid.shape))
@@ -126,12 +126,12 @@ class _Views:
         return usable & (self.data[view] > 0) if foreground else usable
 
     def of(self, view: int, pixels: Places) -> tuple[F32, F32]:
-        """Values and weights of pixels."""
+        """Values and weights of some pixels of a view."""
         known = np.ones(pixels.size, np.float32) if self.weights is None else self.weights[view].reshape(-1)[pixels]
         return self.data[view].reshape(-1)[pixels], known
 
     def mean_density(self) -> float:
-        """In the box, from some rays of each view."""
+        """Mean density in the box, from some rays of each view."""
         pixels = np.arange(0, self.data[0].size, max(1, self.data[0].size // _SOME))
         lengths = sum(float(rays_of(self.geometry, v, pixels, self.grid).lengths.sum()) for v in range(len(self.data)))
         return float(self.data.reshape(len(self.data), -1)[:, pixels].sum()) / max(lengths, 1e-9)
@@ -217,7 +217,7 @@ class _Fit:
     def run(self, used: Places, kept: Places) -> None:
         method, now = self.method, self.control.now
         lit = [int(view) for view in used if self.views.usable(int(view), method.foreground).any()]
-        judges = self._judges(kept)
+        judges = self._judging_rays(kept)
         order: list[int] = []
         seconds = math.inf if method.seconds is None else method.seconds - (now() - self.begin)
         started, reported = now(), -math.inf
@@ -230,7 +230,7 @@ class _Fit:
             order = order or self.rng.permutation(lit).tolist()
             self._advance(order.pop(), method.rate * (_DROP if share >= _DROP_AT else 1.0))
             if judges and share * _LOOKS >= self.looks:
-                self._look(judges)
+                self._measure_held_out(judges)
             if now() - reported > 0.1:
                 reported = now()
                 self._report(len(used))
@@ -240,7 +240,7 @@ class _Fit:
                 break
         self.seconds_of_steps = now() - started
         if judges:
-            self._look(judges)
+            self._measure_held_out(judges)
         self._report(len(used))
         if self.best.network:
             self.network.load_state_dict(self.best.network)
@@ -275,14 +275,14 @@ class _Fit:
     def _tensor(self, values: F32) -> Tensor:
         return torch.from_numpy(values).to(self.device)
 
-    def _judges(self, kept: Places) -> list[tuple[int, Places]]:
+    def _judging_rays(self, kept: Places) -> list[tuple[int, Places]]:
         """Rays of views held out, the same at every look."""
         share = -(-_JUDGES // max(1, kept.size))
         pixels_of_views = ((int(view), np.flatnonzero(self.views.usable(int(view), False))) for view in kept)
         return [(view, pixels[:: max(1, pixels.size // share)]) for view, pixels in pixels_of_views if pixels.size]
 
     @torch.no_grad()
-    def _look(self, judges: list[tuple[int, Places]]) -> None:
+    def _measure_held_out(self, judges: list[tuple[int, Places]]) -> None:
         middles = (np.arange(self.samples, dtype=np.float32) + np.float32(0.5)) / np.float32(self.samples)
         left = scale = 0.0
         for view, pixels in judges:

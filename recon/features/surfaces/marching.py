@@ -29,7 +29,7 @@ class Mesh:
 
     @property
     def volume(self) -> float:
-        """Of the matter inside: a sixth of Σ a · (b x c) over the triangles (divergence theorem)."""
+        """Volume of the matter inside: a sixth of Σ a · (b x c) over the triangles (divergence theorem)."""
         if not len(self.faces):
             return 0.0
         a, b, c = np.moveaxis((self.vertices - self.vertices.mean(axis=0))[self.faces], 1, 0)
@@ -145,7 +145,7 @@ def _in_mm(vertices: F32, grid: Grid) -> F32:
 
 
 def _least(data: BySlices, n: int, thick: int, level: float) -> float:
-    """How far from the level a voxel must be, so that no vertex of float32 falls on a corner of the lattice."""
+    """Least distance of a voxel from the level, so that no vertex of float32 falls on a corner of the lattice."""
     largest = 0.0
     for first in range(0, n, thick):
         values = np.asarray(data[first : first + thick], np.float32)

@@ -27,7 +27,7 @@ OUTLIER = 4.0  # Median distances from the line beyond which a band does not cou
 
 @dataclass(frozen=True)
 class PairAlignment:
-    """Where the rotation axis is.
+    """Position and tilt of the rotation axis.
 
     Attributes:
         axis_col: its column at the middle row, 0 at the centre of the first column.

@@ -88,12 +88,13 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
 
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"])
-    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
     parts = _prepared(scans["bent"], buffer=buffer)
     np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
     assert parts.done["background"].sentence == whole.done["background"].sentence
 
 
+@pytest.mark.slow
 def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:
     said, record = _recon(scans["bent"], tmp_path / "v.h5", "--follow", "--seconds", "1", "--no-report")
     assert "taken off" in record and record in said

@@ -88,7 +88,6 @@ def test_configuration_faults(tmp_path: Path) -> None:
 
 def test_usage() -> None:
     assert run().exit_code == 2
-    assert run("absent.yaml").exit_code == 2
 
 
 def test_as_a_process_without_devices() -> None:

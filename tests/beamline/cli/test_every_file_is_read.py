@@ -14,7 +14,7 @@ import pytest
 
 from beamline.page.volume import ShownVolume
 from beamline.reconstruct.measure import read_truth
-from beamline.simulate.volumes import volumes_beside
+from beamline.simulate.labels import volumes_beside
 from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged
@@ -187,9 +187,20 @@ OTHERS: dict[str, tuple[str, ...]] = {
 
 
 @pytest.mark.parametrize("name", [*SCANS, *FLOATS, *GREYS, *LABELS, *OTHERS])
-def test_no_output_takes_the_place_of_a_link(written: Path, tmp_path: Path, name: str) -> None:
-    """As one to a disk that is not mounted."""
+def test_no_output_takes_the_place_of_what_is_there(written: Path, tmp_path: Path, name: str) -> None:
+    """Of a file, a folder, or a link, as one to a disk that is not mounted."""
     command = {**SCANS, **FLOATS, **GREYS, **LABELS, **OTHERS}[name]
+    there = tmp_path / name
+    if name in ("study", "tradeoff", "batch"):
+        there.mkdir()
+        mine = there / "mine"
+    else:
+        mine = there
+    mine.touch()
+    done = beamline(*command, str(there))
+    assert done.exit_code == 5 and str(there) in done.output, done.output
+    assert mine.stat().st_size == 0 and {*tmp_path.rglob("*")} == {there, mine}
+    there.rename(tmp_path.with_name(f"{tmp_path.name}_aside"))
     away, link = tmp_path / "away", tmp_path / name
     link.symlink_to(away)
     done = beamline(*command, str(link))

@@ -59,21 +59,20 @@ def in_turn(folder: Path, commands: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def test_a_wrong_file_is_refused_before_anything_heavy_is_loaded(tmp_path: Path) -> None:
-    (tmp_path / "wrong.h5").write_text("no HDF5", encoding="utf-8")
-    (tmp_path / "bad.yaml").write_text("scan: {nonsense: 3}", encoding="utf-8")
-    wrong, light = "wrong.h5", ("check home tune scan doctor", "info recover ingest export archive monitor view")
-    commands = [f"{name} bad.yaml" for name in light[0].split()]
-    commands += [f"{name} {wrong}{' -o out.h5' if name in ('export', 'archive') else ''}" for name in light[1].split()]
-    commands[commands.index(f"ingest {wrong}")] += " out.h5"
-    kernels = ["recon -m fbp", "recon -m r2", "voxelise -o out.h5", "render -o out.h5", "surface -o out.stl"]
-    lines = in_turn(tmp_path, "\n".join(commands + [f"{words} {wrong}" for words in kernels]))
-    assert lines[: len(commands)] == [f"{words.split()[0]} refused" for words in commands]
-    assert lines[len(commands) :] == [f"{words.split()[0]} refused numba" for words in kernels]
-
-
-def test_work_loads_what_it_uses(tmp_path: Path) -> None:
+def test_work_loads_what_it_uses_and_a_wrong_file_nothing_heavy(tmp_path: Path) -> None:
     """FBP computes without torch, and without the parts of scipy that take a second to load."""
     write_exchange(tmp_path / "scan.h5", SCAN)
-    lines = in_turn(tmp_path, "runs .\nvalidate scan.h5\ninfo scan.h5\nrecon -m fbp scan.h5 -o v.h5 --no-report")
-    assert lines == ["runs done", "validate done", "info done", "recon done numba"]
+    (tmp_path / "wrong.h5").write_text("no HDF5", encoding="utf-8")
+    (tmp_path / "bad.yaml").write_text("scan: {nonsense: 3}", encoding="utf-8")
+    light = ["runs .", "validate scan.h5", "info scan.h5"]
+    wrong = [f"{name} bad.yaml" for name in ("check", "home", "tune", "scan", "doctor")]
+    wrong += [f"{name} wrong.h5" for name in ("info", "recover", "monitor", "view")]
+    wrong += ["ingest wrong.h5 out.h5", "export wrong.h5 -o out.h5", "archive wrong.h5 -o out.h5"]
+    kernels = ["recon -m fbp", "recon -m r2", "voxelise -o out.h5", "render -o out.h5", "surface -o out.stl"]
+    kernels = [f"{words} wrong.h5" for words in kernels]
+    works = "recon -m fbp scan.h5 -o v.h5 --no-report"
+    lines = in_turn(tmp_path, "\n".join([*light, *wrong, *kernels, works]))
+    names = [[words.split()[0] for words in each] for each in (light, wrong, kernels)]
+    assert lines[: len(light)] == [f"{name} done" for name in names[0]]
+    assert lines[len(light) : -len(kernels) - 1] == [f"{name} refused" for name in names[1]]
+    assert lines[-len(kernels) - 1 :] == [*(f"{name} refused numba" for name in names[2]), "recon done numba"]

@@ -76,13 +76,6 @@ def test_bad_references_are_told_and_limits_may_be_given(here: Path) -> None:
     assert beamline("monitor", "lit.h5", "--set", "references.light_in_darks=0.9").exit_code == 2
 
 
-@pytest.mark.parametrize("name", ["missing.h5", "text.h5"])
-def test_files_that_cannot_be_read(here: Path, name: str) -> None:
-    (here / "text.h5").write_text("no scan")
-    result = beamline("monitor", name)
-    assert result.exit_code == 5 and name in result.stderr
-
-
 @pytest.mark.usefixtures("real_pictures")
 def test_the_worst_frames_may_be_had_as_a_picture(here: Path) -> None:
     assert beamline("monitor", "scan.h5", "--sheet", "sheet.png").exit_code == 7

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.cli.option_groups import GROUPS, METHOD, OUTPUT, Grouped, heading
+from beamline.cli.recipe import GROUPS, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.terminal import Terminal
 from beamline.core.events import FitReached
 from beamline.core.process import with_our_path

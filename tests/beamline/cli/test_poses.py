@@ -92,6 +92,7 @@ def test_methods_that_judge_by_views_held_out_take_poses(tmp_path: Path, method:
     assert code == 0, said
 
 
+@pytest.mark.slow
 def test_slabs_take_shifts_and_refuse_views_that_lean(tmp_path: Path) -> None:
     geometry = replace(posed(0 * TURNS), detector_shape=(160, SHAPE[1]), axis_row=79.5)
     path = scan(tmp_path, geometry, AXES * (1, 1, 8))

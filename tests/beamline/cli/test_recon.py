@@ -20,6 +20,7 @@ from recon.base.empirical import DEFAULT_STEPS
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import frames_of, write_exchange, write_flagged
 from tests.recon.prep.ring_score import ring_score
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -52,7 +53,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
         return np.array(record.volume.data[:])
 
 
-@pytest.mark.parametrize("name", ["v.h5", "v.tif", "v", "v.npy", "v.nrrd"])
+@pytest.mark.parametrize("name", others_slow(["v.h5", "v", "v.tif", "v.npy", "v.nrrd"], 2))
 def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndarray, name: str) -> None:
     result = beamline("recon", "scan.h5", "-m", "fbp", "-o", name)
     assert result.exit_code == 0, result.output
@@ -169,14 +170,15 @@ def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path,
     assert ("views held out" in result.stderr) is (code == 6)
 
 
+@pytest.mark.slow
 def test_a_budget_says_what_it_chose_and_what_more_would_cost(folder: Path) -> None:
-    result = beamline("recon", "scan.h5", "--axis", "20.7", "--budget", "5s", "--no-report")
+    result = beamline("recon", "scan.h5", "--axis", "20.7", "--budget", "1s", "--no-report")
     assert result.exit_code == 0, result.output
     lines = dict(line.split(maxsplit=1) for line in result.stdout.splitlines() if line.startswith("chosen"))
-    assert "of 5 s; " in lines["chosen"]
+    assert "of 1 s; " in lines["chosen"]
     assert any(line.startswith("longer    ") for line in result.stdout.splitlines())
     parameters = read_reconstruction(folder / "scan_auto.h5").parameters
-    assert parameters["budget"] == 5 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
+    assert parameters["budget"] == 1 and lines["chosen"].startswith(f"{parameters['chosen_method']}, ")
 
 
 def test_names() -> None:

@@ -194,6 +194,7 @@ def test_a_fit_whose_last_checkpoint_is_lost_writes_its_volume_and_says_so(
     assert read_reconstruction(folder / "out.h5").volume.data.any()
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = ("--steps", "60", "--gaussians", "50", "--axis", "20.7", "--no-report")
     assert beamline("recon", "scan.h5", *options, "-o", "whole.h5").exit_code == 0

@@ -142,7 +142,7 @@ _BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("0x" + "f" * 5000, "a number has 5002 digits"),
         ("1e400", "scan.exposure_s is"),
         ("&a [*a]", "contains itself"),
-        ("[" * 3000, "nested too deeply"),
+        ("[" * 1000, "nested too deeply"),
         ("!!python/name:os.system", "could not determine a constructor"),
     ],
 )

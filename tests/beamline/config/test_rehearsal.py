@@ -16,6 +16,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from drivers.stages.registry import STAGES
+from tests.slow_cases import others_slow
 
 INSTRUMENT = config_folder() / "instrument.yaml"
 LIMITS = "counts_per_turn: 360000, max_speed_deg_s: 10, acceleration_deg_s2: 20, low_deg: -5, high_deg: 365"
@@ -89,7 +90,9 @@ def test_every_stage_has_a_simulated_counterpart(kind: str) -> None:
     assert found.devices.stage.port == f"sim://{kind}"
 
 
-@pytest.mark.parametrize("name", ["as shipped", "sample moved by a motor", "filters behind EPICS", "inverted pulses"])
+@pytest.mark.parametrize(
+    "name", others_slow(["as shipped", "inverted pulses", "sample moved by a motor", "filters behind EPICS"], 2)
+)
 def test_the_scan_runs_to_its_end(tmp_path: Path, name: str) -> None:
     events: list[Event] = []
     result = run_scan(_rehearsed(*SMALL, *DEVICES[name]), tmp_path, [events.append])

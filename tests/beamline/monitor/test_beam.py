@@ -17,6 +17,7 @@ from beamline.monitor.view import grid_of, view_of
 from beamline.monitor.watch import look, start
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.blobs import BLOCK, STEP, Blobs
+from tests.slow_cases import others_slow
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -46,7 +47,7 @@ def over_scan(views: int, **more: Any) -> tuple[list[Flag], str]:
     return found, monitor.drift()
 
 
-@pytest.mark.parametrize("percent", [-30.0, -9.0, -3.0, 3.0, 9.0])
+@pytest.mark.parametrize("percent", others_slow([-9.0, 3.0, -30.0, -3.0, 9.0], 2))
 def test_the_drift_over_the_scan_is_stated_and_no_other_check_takes_it_for_the_sample(percent: float) -> None:
     flags, said = over_scan(200, counts=lambda view, image: image * (1 + percent / 100 * view / 199))
     assert f"The light {'fell' if percent < 0 else 'rose'} by" in said

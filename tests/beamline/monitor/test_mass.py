@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
+from tests.slow_cases import others_slow
 
 SAMPLE = ((0.0, 0.0, 30.0, 0.02), (10.0, 5.0, 8.0, 0.05), (-12.0, 3.0, 6.0, 0.05))
 
@@ -50,7 +51,7 @@ def test_a_beam_that_loses_three_percent_is_not_mass(fake: Any) -> None:
     assert only(fake.flags(frames)) == []
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.03, 0.09, 0.3])
+@pytest.mark.parametrize("lost", others_slow([0.09, 0.3, 0.0, 0.03], 2))
 def test_thin_matter_that_passes_the_edges_is_no_mass_that_left_while_the_beam_weakens(fake: Any, lost: float) -> None:
     beside = (*SAMPLE, (0.0, 41.0, 5.0, 0.006), (0.0, -41.0, 5.0, 0.006))  # in both edges at 90°
     frames = fake.references()

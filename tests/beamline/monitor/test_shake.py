@@ -11,6 +11,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
+from tests.slow_cases import others_slow
 
 SPOTLESS = [check for check in CHECKS if check.name != "pixels"]  # these scans have previews and no pixels
 
@@ -27,7 +28,9 @@ def shaking(
     return scan.flags(SPOTLESS, step=step)
 
 
-@pytest.mark.parametrize(("across", "down", "seed"), [(0.4, 0.9, 0), (0.65, 0.65, 1), (1.3, 0.35, 2), (0.65, 0.65, 7)])
+@pytest.mark.parametrize(
+    ("across", "down", "seed"), others_slow([(0.4, 0.9, 0), (1.3, 0.35, 2), (0.65, 0.65, 1), (0.65, 0.65, 7)], 2)
+)
 def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, down: float, seed: int) -> None:
     flags = [flag for flag in shaking(across, down, seed=seed) if flag.level is not Level.INFO]
     assert [(flag.check, flag.level) for flag in flags] == [("motion", Level.WARN)]
@@ -43,7 +46,9 @@ def test_the_other_direction_stays_small(direction: tuple[float, float]) -> None
     assert min(told) < 0.15 < 0.4 < max(told)
 
 
-@pytest.mark.parametrize(("seed", "step", "creep"), [(0, 0.004, 0.0), (1, 0.01, 0.02), (2, 0.03, -0.1), (3, 0.03, 0.0)])
+@pytest.mark.parametrize(
+    ("seed", "step", "creep"), others_slow([(0, 0.004, 0.0), (2, 0.03, -0.1), (1, 0.01, 0.02), (3, 0.03, 0.0)], 2)
+)
 def test_a_sample_that_turns_and_creeps_does_not_shake(seed: int, step: float, creep: float) -> None:
     assert not [flag for flag in shaking(0, 0, seed=seed, creep=creep, step=step) if "shakes" in flag.advice]
 

@@ -23,13 +23,13 @@ CONTEXT = ScanContext(saturation=65535, pixels=100)
 
 
 def test_a_clean_scan_raises_no_flag(fake: Any) -> None:
-    frames = fake.references() + fake.views(720) + fake.flats() + fake.darks()
+    frames = fake.references() + fake.views(400) + fake.flats() + fake.darks()
     assert fake.flags(frames) == []
 
 
 def test_a_clean_scan_in_jumping_order_raises_no_flag(fake: Any) -> None:
     frames = fake.references()
-    for i in range(300):
+    for i in range(200):
         frames += [replace(frame, trigger=i) for frame in fake.views(1, first=i * 77 % 360)]
     assert fake.flags(frames, period=None) == []
 

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.plan import angles
-from beamline.plan.angles import Retake, middle_of_exposure, retake_block, spread_retakes
-from beamline.plan.plan import Mode
+from beamline.plan import plan as angles
+from beamline.plan.plan import Mode, Retake, middle_of_exposure, retake_block, spread_retakes
 from beamline.plan.timeline import work_out
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument

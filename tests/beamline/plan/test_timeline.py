@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan import angles
+from beamline.plan import plan as angles
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import block_seconds, describe, move_seconds, passes, taxi_angle, work_out
 from drivers.base.errors import DeviceRefused

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan import angles
-from beamline.plan.triggers import Scale, plan_flight
+from beamline.plan import plan as angles
+from beamline.plan.limits import Scale, plan_flight
 from drivers.base.protocols import TriggerTrain
 
 COUNTS = st.sampled_from([7200, 36_000, 360_000, 1_048_576])

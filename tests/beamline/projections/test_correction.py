@@ -19,6 +19,7 @@ from beamline.storage.rules.references import references_usable
 from recon.prep.correct import Correction, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
 
@@ -59,7 +60,7 @@ def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
-@pytest.mark.parametrize("sizes", [[45], [1] * 45, [32, 13], [7, 20, 18]])
+@pytest.mark.parametrize("sizes", others_slow([[45], [7, 20, 18], [1] * 45, [32, 13]], 2))
 @pytest.mark.parametrize("ended", ["with the last batch", "later"])
 def test_batches_are_the_views_at_once_also_where_the_end_comes_later(sizes: list[int], air: str, ended: str) -> None:
     counts = SCAN.counts()

@@ -51,7 +51,7 @@ def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("on_disk", [False, True])
 def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, on_disk: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
-    buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7, lambda n, of: None) if on_disk else None
+    buffer = DiskBuffer(np.empty((45, height, 40), np.float32), 7) if on_disk else None
     prepared, told = prepare(path, buffer=buffer, rows=rows)
     np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
     said = " ".join(told)

@@ -8,7 +8,7 @@ import pytest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
-from beamline.report.contact_sheet import contact_sheet
+from beamline.report.sheets import contact_sheet
 from beamline.storage.flag_legend import TODAY, FrameFlags, mark_of
 from tests.beamline.array_source import ArraySource
 

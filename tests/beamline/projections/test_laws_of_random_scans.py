@@ -9,6 +9,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from tests.beamline.array_source import ArraySource
 from tests.recon.prep.balls import Balls
+from tests.slow_cases import others_slow
 
 LAWS = "mass", "centre of mass", "higher or lower", "turn", "as the flats", "noise of the views", "scaled by itself"
 
@@ -65,7 +66,7 @@ def test_a_mass_that_changes_is_told_with_its_way(factor_of: object, words: str)
     assert words in sentence
 
 
-@pytest.mark.parametrize(("by_deg", "ramp"), [(20.0, False), (40.0, False), (6.0, True), (-6.0, True)])
+@pytest.mark.parametrize(("by_deg", "ramp"), others_slow([(20.0, False), (6.0, True), (40.0, False), (-6.0, True)], 2))
 def test_views_that_are_late_are_told_with_their_frames(by_deg: float, ramp: bool) -> None:
     """From the middle on, or by a speed that grows or falls along the scan."""
 

@@ -138,7 +138,7 @@ def the_same(found: list[Flag], path: Path) -> None:
     np.testing.assert_array_equal(again.regions, written.regions)
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(
     preview_bin=st.sampled_from([1, 3, 4, 5, 8, 12, 16]),
     rows=st.integers(17, 40),

@@ -263,7 +263,7 @@ def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.Monke
     ("name", "expected", "tolerance"),
     [
         ("diamond_24737_parallel_91x135x160.h5", 85.75, 0.5),
-        ("aps2bm_tooth_181x2x640.h5", 295.6, 0.5),
+        pytest.param("aps2bm_tooth_181x2x640.h5", 295.6, 0.5, marks=pytest.mark.slow),
     ],
 )
 def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:

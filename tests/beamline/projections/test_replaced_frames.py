@@ -16,6 +16,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.rules.references import reference_groups
 from drivers.base.frame import FrameKind
 from tests.beamline.projections.replaced import AXIS, BEAM, VIEWS, Blocks, decibels, line_integrals
+from tests.slow_cases import others_slow
 
 DARK, FLAT, VIEW = FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION
 OTHERS = {DARK: (FLAT, VIEW), FLAT: (DARK, VIEW)}
@@ -56,7 +57,7 @@ def test_any_group_or_frame_of_another_kind_is_named_or_refused(
     assert told and all(f"The {kind.name.lower()}s " in line and "used instead" in line for line in told)
 
 
-@pytest.mark.parametrize("n", [3, 5, 10])
+@pytest.mark.parametrize("n", others_slow([3, 5, 10]))
 def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
     for share in (1.0, 0.5):
         blocks = Blocks(1, n)
@@ -66,7 +67,7 @@ def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
         assert line.startswith("The darks 0: there is light in them")
 
 
-@pytest.mark.parametrize("scale", [0.05, 1.0, 3.0])
+@pytest.mark.parametrize("scale", others_slow([1.0, 0.05, 3.0]))
 @pytest.mark.parametrize("at", [0, 1, 2])
 def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(scale: float, at: int) -> None:
     blocks = Blocks(3, 3, scale)
@@ -91,7 +92,7 @@ def _flats_through(blocks: Blocks, what: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("what", ["displaced", "another sample", "a blade"])
-@pytest.mark.parametrize("at", [0, 1])
+@pytest.mark.parametrize("at", others_slow([1, 0]))
 def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine(what: str, at: int) -> None:
     """The flats differ from one another, and not those are left out that look more like views."""
     blocks = Blocks(2, 3)

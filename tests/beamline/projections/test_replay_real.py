@@ -21,6 +21,7 @@ from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
+from tests.slow_cases import others_slow
 
 DIAMOND = "diamond_24737_parallel_91x135x160.h5"
 TOOTH = "aps2bm_tooth_181x2x640.h5"
@@ -89,7 +90,7 @@ def band(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
     return np.where((row >= 50) & (row < 54) & (40 <= view < 45), 0.0, 1.0)
 
 
-@pytest.mark.parametrize(("share", "check"), [(crumb, "floater"), (fog, "ghost"), (band, "bands")])
+@pytest.mark.parametrize(("share", "check"), others_slow([(crumb, "floater"), (fog, "ghost"), (band, "bands")]))
 def test_what_is_put_into_a_real_scan_is_found(shared_data: Path, share: Share, check: str) -> None:
     own = {(flag.check, flag.frames) for flag in flags(shared_data / DIAMOND)}
     found = [flag for flag in flags(shared_data / DIAMOND, share) if (flag.check, flag.frames) not in own]

@@ -23,6 +23,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.volume import Volume
+from tests.slow_cases import others_slow
 
 # (x, y, z, radius) in mm, and 1/mm; the field is 4 x 2.4 mm
 BALLS = (
@@ -187,7 +188,7 @@ SAME: dict[str, tuple[Instrument, tuple[Put, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", SAME)
+@pytest.mark.parametrize("name", others_slow(SAME, 6))
 def test_a_field_that_is_used_gives_the_volume(tmp_path: Path, expected: float, name: str) -> None:
     made, more = SAME[name]
     assert psnr(nxtomo(tmp_path / "s.nx", made, *more)) > expected - 0.5
@@ -206,14 +207,14 @@ REFUSED: dict[str, tuple[Instrument, tuple[Put, ...], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", others_slow(REFUSED, 5))
 def test_a_field_that_cannot_be_is_refused_by_its_name(tmp_path: Path, name: str) -> None:
     made, more, said = REFUSED[name]
     with pytest.raises((DataError, ConfigError), match=said):
         psnr(nxtomo(tmp_path / "s.nx", made, *more))
 
 
-@pytest.mark.parametrize("axes", [None, "y:theta:x", "x:y:theta", "theta:x:y"])
+@pytest.mark.parametrize("axes", others_slow([None, "y:theta:x", "x:y:theta", "theta:x:y"], 2))
 def test_any_order_of_axes_gives_the_volume(tmp_path: Path, expected: float, axes: str | None) -> None:
     detector = "measurement/instrument/detector"
     sizes = [(f"{detector}/{side}_pixel_size", PITCH * 1e-3, "m") for side in "xy"]

@@ -9,9 +9,9 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.truncation import cut_sides
 from recon.base.geometry import Geometry
 from recon.voxels.fbp import fbp
+from recon.voxels.field_edges import FieldEdges
 from tests.beamline.array_source import ArraySource
 
 VIEWS, SHAPE, MU = 90, (4, 64), 0.004
@@ -83,6 +83,6 @@ def test_a_beam_weaker_than_its_flats_is_levelled_by_its_air(level: float) -> No
 def test_a_full_turn_about_an_axis_beside_the_middle_is_cut_on_purpose() -> None:
     angles = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     lines = np.broadcast_to(np.linspace(1, 0, 64), (180, 2, 64)).astype(np.float32)
-    assert cut_sides(lines, Geometry.parallel(angles, (2, 64), axis_col=8.0)) == {}
-    assert set(cut_sides(lines, Geometry.parallel(angles / 2, (2, 64), axis_col=8.0))) == {"left"}
-    assert set(cut_sides(lines[:, :, ::-1], Geometry.parallel(angles, (2, 64), axis_col=8.0))) == {"right"}
+    assert FieldEdges.of(lines, Geometry.parallel(angles, (2, 64), axis_col=8.0)).beyond() == {}
+    assert set(FieldEdges.of(lines, Geometry.parallel(angles / 2, (2, 64), axis_col=8.0)).beyond()) == {"left"}
+    assert set(FieldEdges.of(lines[:, :, ::-1], Geometry.parallel(angles, (2, 64), axis_col=8.0)).beyond()) == {"right"}

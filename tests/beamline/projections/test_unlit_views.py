@@ -71,7 +71,7 @@ def test_in_slabs_and_while_a_scan_grows_they_are_the_same() -> None:
     unlit, frames = [3, 30, 31], FIRST + np.arange(VIEWS)
     source = scan(unlit, 0.0)
     at_once = ScanCorrection(source, SELECTION, lambda _: None).at_once(frames)  # type: ignore[arg-type]
-    spilt = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    spilt = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
     told: list[str] = []
     in_slabs = prepare_projections(source, SELECTION, told.append, spilt)  # type: ignore[arg-type]
     np.testing.assert_array_equal(in_slabs.projections.data, at_once.data)

@@ -36,6 +36,7 @@ from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -65,7 +66,7 @@ def _as_fast_as(monkeypatch: pytest.MonkeyPatch, *speeds: float) -> None:
     monkeypatch.setattr(module, "speeds_of", lambda *_: Speeds(*speeds))
 
 
-@pytest.mark.parametrize("budget", [5.0, 8.0, 12.0])
+@pytest.mark.parametrize("budget", others_slow([5.0, 8.0, 12.0], 2))
 def test_the_time_is_used_and_not_exceeded(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch, budget: float
 ) -> None:
@@ -107,6 +108,7 @@ def test_a_slow_machine_takes_fbp_of_binned_pixels(
     assert "binned 2 x 2" in done.chosen and done.chosen.startswith("fbp")
 
 
+@pytest.mark.slow
 def test_too_little_time_leaves_the_cheapest_choice_which_is_said_to_be_late(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,6 +258,7 @@ def _cone(
     )
 
 
+@pytest.mark.slow
 def test_a_cones_budget_counts_pixels_at_the_axis(prepared: PreparedProjections) -> None:
     """Magnified ten times, a pixel is ten voxels wide on the detector, and one at the axis."""
     cone = _cone(prepared, 2 * np.pi)
@@ -311,6 +314,7 @@ def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) 
     assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
 
 
+@pytest.mark.slow
 def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
@@ -335,6 +339,7 @@ def test_a_binned_choice_reaches_truth_file_and_report(tmp_path: Path, monkeypat
     assert done["chosen"] in page and done["next_db_said"] in page
 
 
+@pytest.mark.slow
 def test_a_preset_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     options = ReconOptions(

@@ -16,6 +16,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from recon.voxels import iterative
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.slow_cases import others_slow
 
 FISTA = (
     "recon",
@@ -65,7 +66,9 @@ def deviation(*options: str) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(("options", "name"), [(FISTA, "fista-tv.h5"), (FBP, "fbp.h5")], ids=["fista-tv", "fbp"])
+@pytest.mark.parametrize(
+    ("options", "name"), others_slow([(FBP, "fbp.h5"), (FISTA, "fista-tv.h5")]), ids=["fbp", "fista-tv"]
+)
 def test_the_file_holds_a_second_volume_with_its_unit(
     made: Path, folder: Path, options: tuple[str, ...], name: str
 ) -> None:

@@ -152,6 +152,7 @@ def test_a_stop_does_not_wait_for_all_views_of_a_scan_that_has_ended(
     assert f"Stopped: the volume is of the first {n_views} of 30 views." in told
 
 
+@pytest.mark.slow
 def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), pause=5 * RHYTHM.patience)
@@ -243,6 +244,7 @@ def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert asked[0][0] >= 24 and asked[-1][0] == enough["n_views"]
 
 
+@pytest.mark.slow
 def test_where_the_plan_is_not_known_no_views_are_enough(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     scan = replace(INTERLACED, angles=np.radians(np.arange(0, 180, 3.0))[np.argsort(np.arange(60) * 0.618 % 1)])

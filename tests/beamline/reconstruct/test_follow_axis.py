@@ -60,6 +60,7 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
     assert metrics["residual"] < 0.1
 
 
+@pytest.mark.slow
 def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

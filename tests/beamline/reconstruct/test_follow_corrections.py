@@ -43,11 +43,12 @@ from tests.beamline.reconstruct.growing_scan import (
     schedule,
 )
 from tests.beamline.scans import DARK, frames_of
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.mark.parametrize("use_flags", [True, False])
+@pytest.mark.parametrize("use_flags", others_slow([True, False]))
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
     clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
@@ -59,7 +60,7 @@ def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: b
     assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
 
-@pytest.mark.parametrize("use_flags", [True, False])
+@pytest.mark.parametrize("use_flags", others_slow([True, False]))
 def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags: bool) -> None:
     """Also where its alarm was ignored, so that the model has learnt from it."""
     clock, events = ScanClock(), list[Event]()
@@ -76,7 +77,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     assert len(anew) == (not use_flags)
 
 
-@pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])
+@pytest.mark.parametrize("late", others_slow([FrameKind.FLAT, FrameKind.DARK]))
 def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, late: FrameKind) -> None:
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
@@ -90,6 +91,7 @@ def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, lat
     assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_beam_of_all_views_counts_as_not_measured(tmp_path: Path) -> None:
     """It cannot be told before the last view; the line integrals are then those of the finished scan."""
     clock, events = ScanClock(), list[Event]()

@@ -10,7 +10,7 @@ import pytest
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import measure, uniform_residual
-from beamline.reconstruct.remarks import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
+from beamline.reconstruct.outcome import needles_warning, not_begun_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume

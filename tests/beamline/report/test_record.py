@@ -8,8 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beamline.report.record import history_arrays, history_from, price_of_decibel, price_text, residual_curve
-from beamline.report.time_curves import quality_against_time
+from beamline.report.record import (
+    history_arrays,
+    history_from,
+    price_of_decibel,
+    price_text,
+    quality_against_time,
+    residual_curve,
+)
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
 from recon.base.method import Progress, Reconstruction
 from recon.base.volume import Grid, Volume

@@ -24,8 +24,8 @@ from beamline.features.files.validate import validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.refusals import checked_views
 from beamline.projections.selection import Selection
+from beamline.projections.views import checked_views
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run

@@ -13,7 +13,7 @@ from beamline.core.events import Event
 from beamline.core.stop import ScanStopped, StopRequest
 from beamline.features.files.describe import describe
 from beamline.features.files.validate import validate
-from beamline.projections.returned import returned_views
+from beamline.projections.flagged_frames import returned_views
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import open_for_resume
 from beamline.scan.run import run_scan

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.scenes.effect_table import effects_text, parameters
+from beamline.scenes.request import effects_text, parameters
 from simulators.effects.catalogue import CATALOGUE, load_effect
 
 

@@ -80,6 +80,7 @@ def test_slabs_that_follow_fit_together(method: Method, rng: np.random.Generator
     assert np.abs(found - whole).max() < (1e-3 if method.traits.halo else 1e-6) * whole.max()
 
 
+@pytest.mark.slow
 def test_fits_of_slabs_fit_together_within_the_noise() -> None:
     """Slabs differ from a fit of all rows by less than fits of two scans do by their noise, also at their edge."""
     geometry = Geometry.parallel(np.arange(40) * np.pi / 40, (48, 40))

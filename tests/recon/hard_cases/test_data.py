@@ -27,6 +27,7 @@ from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
 from tests.recon.hard_cases import spheres
 from tests.recon.helpers import run_steps
+from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 SHAPE = (12, 48)
@@ -151,7 +152,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without).volume.data
 
 
-@pytest.mark.parametrize("value", [1e30, -1e30, 1e9, 3e3, 300.0])
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()

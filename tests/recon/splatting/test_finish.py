@@ -133,6 +133,7 @@ def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     assert filled < direct < 0.6 < 0.8 < opened
 
 
+@pytest.mark.slow
 def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generator) -> None:
     # All views see the corners of the box cut off: the fit explains them by matter beyond the box, and there is none.
     views = Geometry.parallel(np.linspace(0, math.pi, 40, endpoint=False), (12, 32))

@@ -20,6 +20,7 @@ from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -73,7 +74,7 @@ def test_the_errors_along_all_views_are_the_error_of_the_volume() -> None:
 
 
 @pytest.mark.parametrize("views", [24, 48])
-@pytest.mark.parametrize(("steps", "direct"), [(0.05, True), (12, False)])
+@pytest.mark.parametrize(("steps", "direct"), others_slow([(0.05, True), (12, False)]))
 def test_the_better_of_the_fit_and_fbp_is_shown(data: np.ndarray, steps: float, views: int, direct: bool) -> None:
     fit = _grown(data, steps, views)
     shown, of_fit = fit.shown(), fit.snapshot()
@@ -107,6 +108,7 @@ def test_views_held_out_are_learnt_by_the_last_round_alone(data: np.ndarray, mon
     assert {8, 24, 40} <= set(drawn)
 
 
+@pytest.mark.slow
 def test_the_end_is_the_same_however_long_the_fit_had_to_wait(data: np.ndarray) -> None:
     """A fit whose processor was busy has the steps that it missed in its last round; 0.1 dB apart."""
 

@@ -24,6 +24,7 @@ from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock
+from tests.slow_cases import others_slow
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
@@ -85,10 +86,12 @@ def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom
     assert end.n_views == 40 and end.residual < 0.05
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[np.ndarray, float]) -> None:
     np.testing.assert_array_equal(_stream(data, SCATTERED).snapshot().data, streamed[0])
 
 
+@pytest.mark.slow
 def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
     mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
     method = recon.R2(gaussians=1500, fit=FitSettings(**mine))  # type: ignore[arg-type]
@@ -233,7 +236,7 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
     assert model.finish(0.3).n_gaussians == 750
 
 
-@pytest.mark.parametrize("offset", [-1e-5, 1e-5])
+@pytest.mark.parametrize("offset", others_slow([1e-5, -1e-5]))
 def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
     # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
     model = StreamingFit(VIEWS, GRID, 0, gaussians=1500, now=SteppedClock(tick=0.01))
@@ -287,7 +290,7 @@ def test_a_setting_that_would_do_nothing_is_refused() -> None:
         StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))
 
 
-@pytest.mark.parametrize("marred", [3, 30])  # among the first views, and after the model has been placed
+@pytest.mark.parametrize("marred", others_slow([3, 30]))  # among the first views, and after the model has been placed
 def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
     data: np.ndarray, phantom: Phantom, streamed: tuple[np.ndarray, float], marred: int
 ) -> None:

@@ -12,6 +12,7 @@ from recon.kernels.cpu import joseph
 from recon.voxels import direct as direct_module
 from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
+from tests.slow_cases import others_slow
 
 
 def ball_views(geometry: Geometry, radius: float, centre: tuple[float, float, float]) -> NDArray[np.float32]:
@@ -83,7 +84,7 @@ def test_a_ball_anywhere_with_offsets_shifts_and_random_angles(rng: np.random.Ge
     np.testing.assert_allclose(found, centre, atol=0.01)
 
 
-@pytest.mark.parametrize("axis_col", [14.0, 75.0])
+@pytest.mark.parametrize("axis_col", others_slow([14.0, 75.0]))
 def test_a_detector_beside_the_axis_sees_twice_its_half(axis_col: float) -> None:
     """A wide field: balls on the axis and where one half of the turn alone sees them, and air between them."""
     geometry = Geometry.cone(circle(240), (24, 90), 0.1, 30.0, 40.0, axis_col=axis_col)

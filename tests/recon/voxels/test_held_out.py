@@ -21,14 +21,12 @@ from recon.base.geometry import Geometry
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
+from recon.voxels.field_edges import busiest_rows, columns_of_matter, slab_of
 from recon.voxels.held_out import (
     LEAST_VIEWS,
     HeldOutTrial,
     beyond_chance,
-    busiest_rows,
-    columns_of_matter,
     preferred_strength,
-    slab_of,
     split_views,
     unseen_residuals,
 )

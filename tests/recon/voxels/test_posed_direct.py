@@ -12,6 +12,7 @@ from recon.base.volume import Grid
 from recon.voxels.direct import direct, fdk, has_direct_method, posed_direct
 from recon.voxels.fbp import fbp
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
+from tests.slow_cases import others_slow
 
 _AXES, _CENTRE = np.array([0.5, 0.35, 0.4]), np.array([0.12, -0.2, 0.1])
 _GRID = Grid((40, 60, 60), 0.03)
@@ -38,7 +39,7 @@ def test_straight_views_give_the_volume_of_fbp_and_fdk(cone: bool) -> None:
     np.testing.assert_allclose(posed_direct(data, views, _GRID, "hann"), expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("cone", [False, True])
+@pytest.mark.parametrize("cone", others_slow([False, True]))
 def test_leaning_views_are_reconstructed_about_as_well_as_straight_ones(cone: bool) -> None:
     straight = _views(cone)
     wobble = {

@@ -101,14 +101,6 @@ def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share
     assert "Another batch works in out" in refused.output
 
 
-def test_a_folder_of_something_else_is_refused(folder: Path) -> None:
-    (folder / "out").mkdir()
-    result = beamline("batch", "scan.h5", "-o", "out")
-    assert result.exit_code == 5
-    assert left(folder / "out") == set()
-    assert beamline("batch", "no*.h5", "-o", "new").exit_code == 2
-
-
 def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_exchange(folder / "second.h5", SCAN)
     done: list[str] = []

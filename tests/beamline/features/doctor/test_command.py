@@ -103,7 +103,6 @@ def test_a_beam_monitor_is_read(tmp_path: Path) -> None:
 
 
 def test_usage_and_configuration_faults() -> None:
-    assert run("absent.yaml").exit_code == 2
     assert run("--set", "scan.period_s=1").exit_code == 2
     result = run(DEMO, "--json", "--set", "scan.period_s=no")
     assert (result.exit_code, events(result)[-1]["event"]) == (2, "failed")

@@ -129,7 +129,7 @@ def test_sets_of_another_shape_and_a_wrong_scene_are_refused(pet: Path, tmp_path
 
 
 def test_counts_are_not_spilled(pet: Path) -> None:
-    buffer = DiskBuffer(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
+    buffer = DiskBuffer(np.zeros((24, 3, 32), np.float32), 4)
     with open_scan(pet) as source, pytest.raises(DataError, match="stay in memory"):
         prepare_projections(source, Selection(), print, buffer)
 

@@ -102,16 +102,6 @@ def test_info_takes_what_the_caller_says(folder: Path) -> None:
     assert "line_integrals" in result.stdout
 
 
-@pytest.mark.parametrize("command", ["info", "validate"])
-@pytest.mark.parametrize("name", ["missing.h5", "text.h5"])
-def test_unreadable_files(folder: Path, command: str, name: str) -> None:
-    (folder / "text.h5").write_text("no scan")
-    result = _beamline(command, name)
-    assert result.exit_code == 5
-    assert name in result.output
-    assert "Traceback" not in result.output
-
-
 def test_validate_passes_what_we_write(folder: Path) -> None:
     result = _beamline("validate", "scan.h5")
     assert result.exit_code == 0, result.output
@@ -167,15 +157,6 @@ def test_ingest_for_machines(folder: Path) -> None:
     result = _beamline("ingest", "in.tif", "out.h5", "--angles", "angles.txt", "--quantity", "line-integrals", "--json")
     said = json.loads(result.stdout.splitlines()[-1])
     assert (said["event"], said["output"], said["frames"]) == ("done", "out.h5", 18)
-
-
-@pytest.mark.parametrize("command", [("info", "no.h5"), ("validate", "text.h5"), ("ingest", "no.tif", "out.h5")])
-def test_a_failure_is_the_last_json_event(folder: Path, command: tuple[str, ...]) -> None:
-    (folder / "text.h5").write_text("no scan")
-    result = _beamline(*command, "--json")
-    assert result.exit_code == 5
-    last = json.loads(result.stdout.splitlines()[-1])
-    assert (last["event"], last.get("exit_code", 5)) == ("done" if command[0] == "validate" else "failed", 5)
 
 
 def test_ingest_says_how_far_it_is(folder: Path) -> None:

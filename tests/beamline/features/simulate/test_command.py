@@ -161,7 +161,7 @@ def test_a_request_to_end_leaves_nothing_half(folder: Path, monkeypatch: pytest.
         signal.raise_signal(signal.SIGTERM)
 
     before = sorted(path.name for path in folder.iterdir())
-    monkeypatch.setattr("beamline.scenes.truth.write_truth", asked)
+    monkeypatch.setattr("beamline.scenes.scene_file.write_truth", asked)
     result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", "--json")
     assert result.exit_code == 130
     assert [json.loads(line)["event"] for line in result.stdout.splitlines()] == ["failed"]
@@ -246,7 +246,6 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
         (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
         (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
         (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
-        (("scene.yaml", "--out", "there.h5"), 5, "there.h5 exists"),
         (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),
         (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
         (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),

@@ -13,8 +13,7 @@ from beamline.features.simulate.write import scan_of, write_scan
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.scenes.scene_file import open_scene
-from beamline.scenes.truth import Truth, binning_of, truth_of, write_truth
+from beamline.scenes.scene_file import Truth, binning_of, open_scene, truth_of, write_truth
 from beamline.storage.readers.open import open_scan
 from drivers.base.clock import SystemClock
 from recon.base.volume import Grid

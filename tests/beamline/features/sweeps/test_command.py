@@ -98,13 +98,6 @@ def test_nonsense_is_refused_at_once(folder: Path, words: str, why: str) -> None
     assert left(folder) == {"scan.h5"}
 
 
-def test_nothing_is_overwritten(folder: Path) -> None:
-    (folder / "scan_sweep.csv").write_text("mine")
-    result = beamline("sweep", "scan.h5", "filter=hann,ram-lak")
-    assert result.exit_code == 5 and "scan_sweep.csv exists" in result.stderr
-    assert left(folder) == {"scan.h5", "scan_sweep.csv"}
-
-
 @pytest.mark.parametrize("slices", [0, 2])
 def test_an_interrupt_keeps_the_slices_that_are_done(
     folder: Path, monkeypatch: pytest.MonkeyPatch, slices: int

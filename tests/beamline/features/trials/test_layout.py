@@ -18,7 +18,7 @@ from beamline.features.trials.plans import plan, plan_in_equal_time
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.report.html import Picture
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from recon.methods import names_of_one_volume
 from tests.beamline.html_page import parsed_page
 

@@ -18,7 +18,7 @@ from beamline.features.trials import runner
 from beamline.features.trials.launch import DATA, TrialData, averaged
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.worker import measured
-from beamline.report.slice_sheet import SliceSheet
+from beamline.report.sheets import SliceSheet
 from recon.base.volume import Grid
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -187,7 +187,6 @@ def test_ctrl_c_before_the_first_row_leaves_nothing(folder: Path, monkeypatch: p
         (("magic", "scan.h5"), 2, "magic"),
         (("sector", "scan.h5", "-m", "magic"), 2, "magic"),
         (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
-        (("sector", "scan.h5", "-o", "."), 5, "never overwritten"),
         (("sector", "scan.h5", "-m", "fbp", "--steps", "5"), 2, "no row is by one of these"),
         (("sector", "scan.h5", "--seconds", "3", "--steps", "5"), 2, "--steps does not go with --seconds"),
         (("fixed-views", "scan.h5"), 5, "30 views are too few"),

@@ -134,7 +134,6 @@ def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
         (["--max-seconds", "nan"], 2, "finite"),
         (["--seed", "-1"], 2, "--seed"),
         (["-o", "scan.h5"], 2, "scan.h5"),
-        (["-o", "."], 5, "never overwritten"),
         (["scan.h5"], 2, "--spectra"),
         (["--states", "fresh,charged"], 2, "--spectra"),
         (["--time", "3"], 2, "3 volumes of 27 views: expected"),

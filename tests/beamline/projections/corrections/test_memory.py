@@ -88,7 +88,7 @@ def test_a_step_takes_no_more_memory_than_it_states_and_the_budget_has_it(step: 
     assert needs(path, step).steps.correcting == step.memory(part).correcting > needs(path).steps.correcting == 0
 
 
-@pytest.mark.parametrize("shape", [(60, 12, 96), (90, 20, 112)])
+@pytest.mark.parametrize("shape", [(60, 12, 96), pytest.param((90, 20, 112), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("step", ON_ALL.values(), ids=ON_ALL)
 def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape: tuple[int, int, int]) -> None:
     n, rows, cols = shape
@@ -120,6 +120,7 @@ def test_dynamic_flats_take_no_more_than_they_state(pixels: tuple[int, int], fla
     assert 0.5 * view_memory(flats, size) < taken < view_memory(flats, size)
 
 
+@pytest.mark.slow
 def test_the_search_of_the_tilt_takes_no_more_than_it_states(tmp_path: Path) -> None:
     path, step = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(40, 64))), TiltAndLens("auto")
     with open_scan(SourceOptions(path)) as source:

@@ -29,6 +29,7 @@ from recon.base.volume import Grid
 from recon.voxels.direct import direct
 from recon.voxels.projector import seen_rays
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
+from tests.slow_cases import others_slow
 
 SHAPE, PITCH, AXIS = (24, 40), 0.04, 20.6
 N, FIRST = 40, 4  # views; row of the first one: two darks, two flats
@@ -92,7 +93,7 @@ def error(found: PreparedProjections, axes: np.ndarray = AXES) -> float:
     )
 
 
-@pytest.mark.parametrize("by", ["view", "frame", "angle_deg"])
+@pytest.mark.parametrize("by", others_slow(["view", "frame", "angle_deg"]))
 def test_poses_are_those_of_the_file_in_any_order(tmp_path: Path, by: str) -> None:
     found = prepared(scan(tmp_path, posed()), every(tmp_path, by))
     for name in ("angles", "shifts", "roll", "tilt"):
@@ -184,7 +185,9 @@ def shadow_of_pixels(views: Geometry, n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "selected", [{"binning": 2}, {"rows": (3, 21)}, {"rows": (6, 20), "binning": 2}, {"views": "every:2"}], ids=str
+    "selected",
+    others_slow([{"rows": (6, 20), "binning": 2}, {"views": "every:2"}, {"binning": 2}, {"rows": (3, 21)}], 2),
+    ids=str,
 )
 def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, object]) -> None:
     """The true sample explains the part's rays, also those of binned pixels and of rows off the middle."""

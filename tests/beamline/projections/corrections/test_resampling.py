@@ -88,6 +88,7 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
     assert _quality(as_it_is) < _quality(straight) - 1
 
 
+@pytest.mark.slow
 def test_how_far_the_search_and_what_follows_the_correction_are_is_told() -> None:
     events: list[Event] = []
     phases = Phases(events.append, SimpleNamespace(now=itertools.count(0.0, 1.0).__next__))

@@ -98,7 +98,7 @@ def test_a_straight_beam_stays_as_it_is_and_says_so(scans: dict[str, Path]) -> N
 @pytest.mark.slow
 def test_slabs_lose_the_same_background_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"], "background")
-    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
     parts = _prepared(scans["bent"], "background", buffer=buffer)
     assert whole.measured is not None
     np.testing.assert_allclose(

@@ -1,0 +1,16 @@
+"""Cases of a law that take long: the first ones are quick tests, the others slow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+
+
+def others_slow(cases: Iterable[Any], quick: int = 1) -> list[Any]:
+    """For `parametrize`: the cases, a tuple for several arguments, of which those after the first `quick` are slow."""
+    return [
+        case if n < quick else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.slow)
+        for n, case in enumerate(cases)
+    ]
