@@ -117,13 +117,13 @@ class Dummy:
         return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
 '''
     },
-    (("beamline/monitor/checks.py", '    "dark": "DarkCheck",', '    "dummy": "Dummy",'),),
+    (("beamline/monitor/checks.py", '    "DarkCheck": "frames",', '    "Dummy": "dummy",'),),
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.scan import recorder
 from beamline.scan.run import run_scan
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 import h5py
 from pathlib import Path
 
@@ -232,7 +232,7 @@ FORMAT = ScanFormat("an .npy stack", lambda path, opening: path.suffix == ".npy"
     ),
     """
 import numpy as np
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
 
 data = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)

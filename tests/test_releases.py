@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from beamline.storage.readers import tiff
-from beamline.storage.writers import checkpoint
+from beamline.storage.writers import recon_file
 from tests.licences import FOR_DEVELOPERS, FOR_USERS
 
 ROOT = Path(__file__).parents[1]
@@ -47,6 +47,6 @@ def test_the_page_lists_the_extras_of_users(project: dict[str, Any]) -> None:
     assert re.findall(r"(?m)^\| `(\w+)` \|", PAGE) == list(FOR_USERS)
 
 
-@pytest.mark.parametrize("marker", [checkpoint._FORMAT, tiff.VOLUME])
+@pytest.mark.parametrize("marker", [recon_file._FORMAT, tiff.VOLUME])
 def test_the_page_names_each_format_of_ours(marker: str) -> None:
     assert f"`{marker}`" in PAGE

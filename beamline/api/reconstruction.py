@@ -108,7 +108,8 @@ def reconstruct(
         if say is not None and not isinstance(event, VolumeDone) and (text := sentence(event)):
             say(text)
 
-    wanted = selection_of(source, selection, rows=rows, views=views, binning=binning)
+    stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
+    wanted = replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
     with target_of(output) as given:
         target = replace(given, names=volume_names_of(chosen))
         place = str(source.path) if path is not source else list(map(str, (each.path for each in source.scans)))
@@ -125,19 +126,6 @@ def _method(method: str | Method) -> Method:
         return Auto() if method == AUTO else by_name(method)()
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
-
-
-def selection_of(
-    source: SourceOptions | EnergyScans,
-    selection: Selection | None,
-    *,
-    rows: slice | tuple[int, int] | None,
-    views: str | None,
-    binning: int | None,
-) -> Selection:
-    """The selection with rows, views and binning of the arguments."""
-    stated: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
-    return replace(selection or Selection(), **{name: value for name, value in stated.items() if value is not None})
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from importlib import import_module
 
 import click
 
-from recon.base.registry import Registry, in_folders
+from recon.base.registry import Registry, tables_in_folders
 
 
 class Libraries(Enum):
@@ -81,8 +81,16 @@ CORE = {
 
 @cache
 def feature_commands() -> dict[str, CommandEntry]:
-    """The commands of the folders in `beamline.features`, in the order of the folders' names."""
-    return in_folders("beamline.features", "COMMANDS")
+    """The commands of the folders in `beamline.features`, in the order of the folders' names.
+
+    COMMANDS of a folder has the help line, the name in `Libraries`, and perhaps `CommandEntry.files` of each; it is in
+    the folder's module `command`.
+    """
+    return {
+        name: CommandEntry(f"beamline.features.{folder}.command", help_line, Libraries[libraries], *files)
+        for folder, rows in tables_in_folders("beamline.features", "COMMANDS").items()
+        for name, (help_line, libraries, *files) in rows.items()
+    }
 
 
 def own_commands() -> dict[str, CommandEntry]:

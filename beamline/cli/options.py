@@ -18,7 +18,7 @@ from typing import Any
 import click
 from click.exceptions import ClickException, Exit
 
-from beamline.core.errors import DataError, exit_code, user_message
+from beamline.core.errors import exit_code, user_message
 from beamline.core.events import Event, Failed, Sink
 from beamline.core.sinks import JsonLines, fan_out
 from beamline.reconstruct.option_rules import RULES, OptionRule, contradiction
@@ -314,13 +314,6 @@ def json_events(as_json: bool) -> Iterator[Sink]:
         if not (last and last[-1].event in ("done", "failed")):
             lines(Failed(user_message(error), exit_code(error), time=SystemClock().now()))
         raise
-
-
-def require_there(file: Path, as_json: bool) -> None:
-    """Raises DataError at once where there is no scan, before the libraries that compute are loaded."""
-    if not file.exists():
-        with json_events(as_json):
-            raise DataError(f"{file} is not there.")
 
 
 def say(line: str) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from beamline.cli.method_options import method_with, preset_of, settings_of, slabs_resumed
-from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, require_there, rules_of
+from beamline.cli.options import json_events, refuse_contradictions, refuse_shared, rules_of
 from beamline.cli.recipe import Grouped, names_given, recipe_text, repeating
 from beamline.cli.recon_options import recon_options
 from beamline.cli.selection_options import chosen, chosen_steps
@@ -133,8 +133,9 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     values, file = dict(context.params), context.params["file"]
     method = _checked_method(context, default)
     path = values["output"] or Path(f"{file.stem}_{method}.h5")
-    if there:
-        require_there(file, values["as_json"])
+    if there and not file.exists():
+        with json_events(values["as_json"]):
+            raise DataError(f"{file} is not there.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
     from recon.voxels.enough_views import Goal

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, TextIO
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
@@ -35,11 +36,11 @@ from beamline.core.events import (
 )
 from beamline.core.machine_speed import seconds_left
 from beamline.core.process import ChildProcess
-from beamline.core.sinks import sentence
+from beamline.core.sinks import Warnings, sentence
 from beamline.core.stop import terminated_like_interrupted
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
-from drivers.base.clock import Clock
+from drivers.base.clock import Clock, SystemClock
 from drivers.in_beam import Ask
 from recon.base.registry import in_folders
 from recon.methods import BASELINE
@@ -176,6 +177,46 @@ def events_shown(as_json: bool) -> Iterator[Sink]:
     """The sink of a command's events: JSON on stdout, or else the terminal. SIGTERM and SIGHUP interrupt the block."""
     with terminated_like_interrupted(), json_events(as_json) as json_sink, Terminal(sys.stderr) as terminal:
         yield json_sink if as_json else terminal
+
+
+class Answer:
+    """What a command says: events while it works, then its facts to programs, or lines to people.
+
+    Attributes:
+        sink: of events.
+        clock: of their times.
+        lines: for people, once it is done.
+    """
+
+    def __init__(self, sink: Sink) -> None:
+        self.sink, self.clock = sink, SystemClock()
+        self.lines: tuple[str, ...] = ()
+        self._begun = self.clock.now()
+        self.warn = Warnings(sink, self.clock)
+
+    @property
+    def seconds(self) -> float:
+        """Since the command began."""
+        return self.clock.now() - self._begun
+
+    def counting(self, stage: str) -> Callable[[int, int], None]:
+        """See `counting`."""
+        return counting(stage, self.sink, self.clock)
+
+    def done(self, facts: object, *lines: str) -> None:
+        """Send the event `done` with its facts; people get the lines when the work has ended."""
+        self.sink(Done(facts, time=self.clock.now()))
+        self.lines = lines
+
+
+@contextmanager
+def answering(as_json: bool) -> Iterator[Answer]:
+    """The answer of a command; in its end the lines are printed, unless stdout is for JSON."""
+    with events_shown(as_json) as sink:
+        answer = Answer(sink)
+        yield answer
+    if answer.lines and not as_json:
+        click.echo("\n".join(answer.lines))
 
 
 @contextmanager

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 from collections.abc import Iterable, Sequence
 
@@ -53,6 +55,21 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
             groups.append((i, i))
     text = ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in groups[:limit])
     return text if len(groups) <= limit else f"{text}, ... ({len(indices)} in all)"
+
+
+def aligned(rows: Sequence[Sequence[str]], to: str = "<") -> str:
+    """Rows of cells as lines with aligned columns; `to`: "<" the left, ">" the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(f"{cell:{to}{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as CSV, a line each."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
 
 
 def frames_text(frames: Iterable[int]) -> str:

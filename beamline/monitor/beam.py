@@ -15,10 +15,9 @@ from typing import Annotated, ClassVar
 import numpy as np
 import pydantic
 
-from beamline.monitor.change import SampleChange
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light, more_light
+from beamline.monitor.change import FrameScatter, SampleChange
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, light, more_light
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brightest_place
 from drivers.base.frame import Frame, FrameKind
 
@@ -100,7 +99,7 @@ class LightOverScan:
 
 
 @dataclass(frozen=True)
-class BeamCheck:
+class BeamCheck(Logged):
     """Score: lost fraction of the light (negative: gained).
 
     The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
@@ -111,7 +110,6 @@ class BeamCheck:
     bit: ClassVar[int] = 0
     unit: ClassVar[str] = "fraction of the reference light"
     meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
-    policy: ClassVar[Policy] = Policy.LOG
 
     drift: Annotated[float, pydantic.Field(ge=0, description="fraction by which the light may drift, either way")] = (
         0.02

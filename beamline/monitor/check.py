@@ -19,8 +19,7 @@ from beamline.core.flag import Flag as Flag
 from beamline.core.flag import Level as Level
 from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import CellGrid, CellValues, CellView
+from beamline.monitor.view import NO_SPOTS, CellGrid, CellValues, CellView, Spots
 from drivers.base.frame import Frame
 
 State = TypeVar("State")
@@ -128,6 +127,12 @@ class Look(Generic[State]):
 
     state: State
     flag: Flag | None = None
+
+
+class Logged:
+    """A check whose alarms are written down and do nothing else, unless the configuration says otherwise."""
+
+    policy: ClassVar[Policy] = Policy.LOG
 
 
 class Check(Protocol):

@@ -18,18 +18,18 @@ BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one 
 ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # a frame with any of these bits has an alarm
 
 
-REGISTRY = {  # module in this folder: class of the check
-    "beam": "BeamCheck",
-    "saturation": "SaturationCheck",
-    "stuck": "StuckCheck",
-    "timing": "TimingCheck",
-    "mass": "MassCheck",
-    "dark": "DarkCheck",
-    "lost": "LostCheck",
-    "motion": "MotionCheck",
-    "pixels": "PixelsCheck",
-    "field": "FieldOfViewCheck",
-    "opposite": "OppositeCheck",
+REGISTRY = {  # class of a check: its module in this folder
+    "BeamCheck": "beam",
+    "SaturationCheck": "frames",
+    "StuckCheck": "frames",
+    "TimingCheck": "frames",
+    "MassCheck": "field",
+    "DarkCheck": "frames",
+    "LostCheck": "frames",
+    "MotionCheck": "motion",
+    "PixelsCheck": "field",
+    "FieldOfViewCheck": "field",
+    "OppositeCheck": "opposite",
 }
 
 
@@ -62,9 +62,9 @@ def _all(ours: tuple[Check, ...]) -> Registry[Check]:
     return Registry("check", {check.name: check for check in ours}, made)
 
 
-_MODULES = {f"beamline.monitor.{module}": name for module, name in REGISTRY.items()}
+_MODULES = {name: f"beamline.monitor.{module}" for name, module in REGISTRY.items()}
 _CLASSES = {**_MODULES, **in_folders("beamline.monitor", "CHECKS")}
-_OURS = _distinct(*sorted((getattr(import_module(module), name)() for module, name in _CLASSES.items()), key=_bit))
+_OURS = _distinct(*sorted((getattr(import_module(module), name)() for name, module in _CLASSES.items()), key=_bit))
 BY_NAME = _all(_OURS)
 CHECKS: tuple[Check, ...] = tuple(BY_NAME.values())
 """All checks with their default limits, in the order of their bits, in which they look at a frame."""

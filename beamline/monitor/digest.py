@@ -121,12 +121,8 @@ def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: in
     fine = digest(image, saturation, min(block, preview_bin))
     if block == preview_bin:
         return fine, fine
-    shape = image.shape[0], image.shape[1]
-    preview = np.empty(preview_shape(shape, max(block, preview_bin)), np.float32)
-    peaks = np.empty_like(preview)
     side = min(block, preview_bin)
-    _join(fine.preview, fine.peaks, shape, side, max(block, preview_bin) // side, preview, peaks)
-    coarse = replace(fine, preview=preview, peaks=peaks)
+    coarse = _joined(fine, image.shape, side, max(block, preview_bin) // side)
     return (fine, coarse) if block < preview_bin else (coarse, fine)
 
 
@@ -281,24 +277,17 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):
     return least, int(high), total, squares, saturated, histogram
 
 
-@njit(nogil=True, cache=True)
-def _join(means, tops, shape, side, times, preview, peaks):
-    """Fills the preview and peaks of `times` x `times` blocks of `side` pixels; sums of counts, whole numbers, are
-    exact."""
-    for row in range(preview.shape[0]):
-        top, bottom = row * times, min((row + 1) * times, means.shape[0])
-        high = min(bottom * side, shape[0]) - top * side
-        for col in range(preview.shape[1]):
-            left, right = col * times, min((col + 1) * times, means.shape[1])
-            wide = min(right * side, shape[1]) - left * side
-            total, most = 0.0, np.float32(0)
-            for r in range(top, bottom):
-                lines = min((r + 1) * side, shape[0]) - r * side
-                for c in range(left, right):
-                    pixels = lines * (min((c + 1) * side, shape[1]) - c * side)
-                    total += np.rint(np.float64(means[r, c]) * pixels)
-                    most = max(most, tops[r, c])
-            preview[row, col], peaks[row, col] = total / (high * wide), most
+def _joined(fine: FrameDigest, shape: tuple[int, ...], side: int, times: int) -> FrameDigest:
+    """The digest with blocks of `times` x `times` of those of `side` pixels; sums of counts are exact."""
+    pixels = [np.minimum(side, n - np.arange(0, n, side)) for n in shape]
+    first = [np.arange(0, each.size, times) for each in pixels]
+
+    def over_blocks(join: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(join.reduceat(join.reduceat(values, first[0], axis=0), first[1], axis=1))
+
+    counts = np.outer(*pixels)
+    means = over_blocks(np.add, np.rint(fine.preview.astype(np.float64) * counts)) / over_blocks(np.add, counts)
+    return replace(fine, preview=means.astype(np.float32), peaks=over_blocks(np.maximum, fine.peaks))
 
 
 @njit(nogil=True, cache=True)

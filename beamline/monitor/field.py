@@ -1,4 +1,8 @@
-"""Field: parts of the frame without light, and a sample beyond its edges."""
+"""Field: parts of the frame and pixels without light, a sample beyond its edges, and the total absorption within them.
+
+The total of a parallel projection is equal from every side, unless matter entered or left: the moment of order 0 of
+the consistency conditions of Helgason (1965) and Ludwig (1966).
+"""
 
 from __future__ import annotations
 
@@ -9,11 +13,12 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import pydantic
+import scipy
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
-from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import BRIGHT, UNLIT, CellGrid
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, at_edges, light
+from beamline.monitor.digest import LARGEST, FrameDigest
+from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
 from recon.voxels.field_edges import LEAST
@@ -33,7 +38,7 @@ class FieldState:
 
 
 @dataclass(frozen=True)
-class FieldOfViewCheck:
+class FieldOfViewCheck(Logged):
     """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
 
     The defaults: a line integral of 0.1 at the edges is a tenth of the value in a sample's middle. It is more than
@@ -44,7 +49,6 @@ class FieldOfViewCheck:
     bit: ClassVar[int] = 13
     unit: ClassVar[str] = "share of the frame, or line integral at its edge"
     meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
-    policy: ClassVar[Policy] = Policy.LOG
 
     unlit: Annotated[float, pydantic.Field(ge=0, lt=1, description="share of the frame that may be without light")] = (
         0.02
@@ -124,3 +128,169 @@ def _runs(marked: NDArray[np.bool_], step: float) -> list[tuple[int, int]]:
     """First pixel, and the one after the last, of each unbroken run of marked lines of the preview."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
     return [(round(first * step), round(after * step)) for first, after in edges.reshape(-1, 2).tolist()]
+
+
+CALIBRATION = 10  # projections
+SIGMAS = 6.0
+EMPTY = 1e-3  # mean line integral of a field with nothing in it but noise
+
+
+@dataclass(frozen=True)
+class MassState:
+    """`masses`: of the first projections; `usual`: their median, None before; `running`: outliers in a row."""
+
+    masses: tuple[float, ...] = ()
+    usual: float | None = None
+    scatter: float = 0.0
+    running: int = 0
+
+
+@dataclass(frozen=True)
+class MassCheck(Logged):
+    """Score: relative change of the mean line integral. None without light, or if the sample exceeds the field."""
+
+    name: ClassVar[str] = "mass"
+    bit: ClassVar[int] = 5
+    unit: ClassVar[str] = "relative change"
+    meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
+
+    warn: Annotated[float, pydantic.Field(ge=0, description="relative change of the total absorption")] = 0.03
+    frames: Annotated[
+        int, pydantic.Field(ge=1, description="projections in a row beyond the limit that make a finding")
+    ] = 3
+
+    start = MassState
+
+    def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MassState]:
+        view, grid = context.view, context.grid
+        if view is None or grid is None or not grid.flats:
+            return Look(state)
+        if max(at_edges(context)) > AIR:
+            return Look(replace(state, running=0))
+        lit = float(grid.lit.mean())
+        if not lit:
+            return Look(state)
+        # A beam that weakens is no sample that enters; matter at an edge is no beam that weakens.
+        mass = float(view.depth.mean()) / lit - brightest_place(view, grid)
+        if state.usual is None:
+            return Look(_calibrate(state, mass))
+        if state.usual < EMPTY:
+            return Look(state)
+        score = mass / state.usual - 1
+        limit = max(self.warn, SIGMAS * state.scatter)
+        if abs(score) <= limit:
+            return Look(replace(state, running=0))
+        state = replace(state, running=state.running + 1)
+        if state.running < self.frames:
+            return Look(state)
+        advice = (
+            f"The sample's total absorption changed by {score:+.1%} for {state.running} views: something "
+            f"{'entered' if score > 0 else 'left'} the field, or the sample changes. Look at the latest projection."
+        )
+        return Look(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
+
+
+def _calibrate(state: MassState, mass: float) -> MassState:
+    masses = (*state.masses, mass)
+    if len(masses) < CALIBRATION:
+        return replace(state, masses=masses)
+    usual = float(np.median(masses))
+    scatter = median_deviation(np.array(masses) - usual) / usual if usual > 0 else 0.0
+    return replace(state, masses=masses, usual=usual, scatter=scatter)
+
+
+DEAD = 0.2  # share of the light of the darkest preview block around it
+NAMED_PIXELS = 5  # most pixels that are named
+HOLES = 1e-4  # share of the pixels that may hold no number; a column of 4096 is more
+HALF = 0.5  # share of the pixels: with more missing, a view is lost
+
+PixelPlaces = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelsState:
+    """`dead`: places row * columns + column that were dark in all flats of the latest group, None before any.
+
+    `holes`: largest fraction of pixels without a number in a dark or flat: a mask of the detector.
+    """
+
+    dead: PixelPlaces | None = None
+    in_flats: bool = False
+    reported: bool = False
+    holes: float = 0.0
+
+
+@dataclass(frozen=True)
+class PixelsCheck(Logged):
+    """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
+    of the light around them. It is reported at the first view, as a fact where they are few. In a view also the
+    fraction that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where
+    none does.
+
+    The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
+    """
+
+    name: ClassVar[str] = "pixels"
+    bit: ClassVar[int] = 12
+    unit: ClassVar[str] = "fraction of the pixels"
+    meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
+
+    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
+
+    start = PixelsState
+
+    def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
+        holes = digest.invalid_fraction
+        if holes == 1:  # no mask, whatever the frame shows
+            return Look(state, self._without_number(frame.index, holes))
+        if frame.kind is not FrameKind.PROJECTION:
+            state = replace(state, holes=max(state.holes, holes))
+        elif holes - state.holes > HOLES:
+            return Look(state, self._without_number(frame.index, holes - state.holes))
+        if state.reported:
+            return Look(state)
+        if frame.kind is FrameKind.FLAT:
+            dead = _dead(frame, digest, context)
+            if state.in_flats and state.dead is not None:
+                dead = np.intersect1d(state.dead, dead, assume_unique=True)
+            return Look(replace(state, dead=dead, in_flats=True))
+        state = replace(state, in_flats=False)
+        if frame.kind is not FrameKind.PROJECTION or state.dead is None:
+            return Look(state)
+        return Look(replace(state, reported=True), self._flag(frame, state.dead) if state.dead.size else None)
+
+    def _without_number(self, row: int, score: float) -> Flag:
+        advice = (
+            f"{score:.2%} of the pixels hold no number (NaN, infinite or beyond {LARGEST:g}), more than in darks and "
+            "flats: the camera's link, or the program that wrote them. `beamline recon` fills pixels, and leaves out a "
+            "view without any."
+        )
+        return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
+
+    def _flag(self, frame: Frame, dead: PixelPlaces) -> Flag:
+        rows, cols = np.unravel_index(dead, frame.counts.shape)
+        score = dead.size / frame.counts.size
+        level = Level.WARN if score > self.warn else Level.INFO
+        named = ", ".join(f"({row}, {col})" for row, col in zip(rows[:NAMED_PIXELS], cols[:NAMED_PIXELS], strict=True))
+        advice = (
+            f"Pixels without light in the flats where their neighbours have some: {dead.size}, at (row, column) {named}"
+            f"{' ...' if dead.size > NAMED_PIXELS else ''}. Each is a ring in its slice; `beamline recon` fills them "
+            "from their neighbours."
+        )
+        region = int(rows.min()), int(rows.max()) + 1, int(cols.min()), int(cols.max()) + 1
+        return Flag(self.name, level, frame.index, score, self.warn, advice, region)
+
+
+def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlaces:
+    """Places of the pixels of a flat that are dark within a lit block."""
+    above = light(digest.preview, context)
+    block = math.ceil(frame.counts.shape[1] / above.shape[1])
+    dark = digest.preview - above
+    around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow is not dead
+    limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
+    counts, cols = frame.counts, frame.counts.shape[1]
+    places = [
+        row * block * cols + np.flatnonzero(counts[row * block : (row + 1) * block] < np.repeat(line, block)[:cols])
+        for row, line in enumerate(limit.astype(np.float32))
+    ]
+    return np.concatenate(places)

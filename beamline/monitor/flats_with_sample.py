@@ -195,27 +195,31 @@ def with_sample(
         else:
             compared = [(means[at], means[:at] + means[at + 1 :])]
         for i, (image, others) in enumerate(compared):
-            if not others:
+            if (found := _like_a_view(image, others, seen)) is None:
                 continue
-            lit = lit_places(np.maximum.reduce([image, *others]))
-            changes = [_log(image, other, lit) for other in others]
-            change = min(changes, key=_spread)
-            off = _beyond_noise(change)
-            if not off > 0:
-                continue
-            like = [_beyond_noise(_log(image, view, lit)) for view in seen]
-            nearest = int(np.argmin(like))
-            if like[nearest] < LIKER * off:
-                sentence = (
-                    f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
-                    f"line integral, and by {like[nearest]:.2g} only from the view in frame {views[nearest].row}: the "
-                    "sample was in the beam."
-                )
-                frames = [group[i]] if single else group
-                displaced += [
-                    OddFrame(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, sentence) for frame in frames
-                ]
+            off, like, nearest = found
+            sentence = (
+                f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
+                f"line integral, and by {like:.2g} only from the view in frame {views[nearest].row}: the sample was in "
+                "the beam."
+            )
+            frames = [group[i]] if single else group
+            displaced += [OddFrame(frame, FaultKind.SAMPLE_IN, off, like / LIKER, sentence) for frame in frames]
     return displaced
+
+
+def _like_a_view(image: Places, others: Sequence[Places], views: Sequence[Places]) -> tuple[float, float, int] | None:
+    """By how much a flat differs from the most similar of other flats, and from the most similar view, and which that
+    is; None: it is none of a view."""
+    if not others:
+        return None
+    lit = lit_places(np.maximum.reduce([image, *others]))
+    off = _beyond_noise(min((_log(image, other, lit) for other in others), key=_spread))
+    if not off > 0:
+        return None
+    like = [_beyond_noise(_log(image, view, lit)) for view in views]
+    nearest = int(np.argmin(like))
+    return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
 
 
 @dataclass(frozen=True, eq=False)

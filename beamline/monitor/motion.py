@@ -1,4 +1,11 @@
-"""Motion: jumps and slips of the sample, beyond steady rotation, and a sample that shakes."""
+"""Motion: jumps and slips of the sample, beyond steady rotation, and a sample that shakes.
+
+Shake is random displacement from view to view, by vibration or runout of the stage.
+A view that stands x beside its way changes its own comparison with the views before by x, and the next one by -4/3 x:
+there it is the view before, and a third of the velocity. So changes that follow one another have a covariance of -4/3
+of the variance of x. What a model of the turning sample does not know changes slowly: its covariance is positive. This
+tells both apart, whatever the sample.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +15,80 @@ from typing import Annotated, ClassVar
 
 import pydantic
 
-from beamline.monitor.change import SPAN, SampleChange
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.change import SPAN, FrameScatter, SampleChange
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import FrameScatter
 from drivers.base.frame import Frame
+
+PAIRS = 32  # changes that follow one another, before anything is told
+SHAKE_MEMORY = 0.02  # weight of the newest pair
+CLIPPED = 4.0  # mean absolute deviations that count of a change, so that a jump is no vibration
+OWN = 4 / 3  # of the variance of x: minus the covariance of changes that follow one another
+FROM_NOISE = math.sqrt(1 + OWN**2 + 1 / 9)  # sigma of a change over that of a view's own displacement
+SHAKE_SIGMAS = 6.0  # standard deviations of the estimate: a false alarm in 10**9 estimates
+SHAKE_CONFIRMED = 0.5  # share of the changes' variance that their covariance must show
+SPREAD = 2.6  # standard deviation of the estimate for noise alone, over the variance by noise, times sqrt(pairs)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction: the changes' usual size, the last one, and running means of squares, of products of those that
+    follow one another, and of variances by noise."""
+
+    usual: FrameScatter = field(default_factory=FrameScatter)
+    last: float = math.nan
+    square: float = 0.0
+    product: float = 0.0
+    noise: float = 0.0
+
+    def with_figure(self, figure: float, sigma: float, pairs: int) -> Axis:
+        usual = self.usual.with_figure(figure)
+        most = CLIPPED * max(usual.deviation, 1e-9)
+        away = min(max(figure - usual.mean, -most), most)
+        if math.isnan(self.last):
+            return replace(self, usual=usual, last=away)
+        weight = max(SHAKE_MEMORY, 1 / (pairs + 1))
+        square = self.square + weight * (away**2 - self.square)
+        product = self.product + weight * (away * self.last - self.product)
+        noise = self.noise + weight * ((sigma / FROM_NOISE) ** 2 - self.noise)
+        return Axis(usual, away, square, product, noise)
+
+    def size(self, pairs: int) -> float:
+        """Standard deviation of x in pixels, without the part of the noise; 0 where noise alone may give as much.
+
+        The squares tell it more exactly than the products, where these confirm it.
+        """
+        variance, n = -self.product / OWN, min(pairs, round(2 / SHAKE_MEMORY))
+        if pairs < PAIRS or variance < self.noise * (1 + SHAKE_SIGMAS * SPREAD / math.sqrt(n)):
+            return 0.0
+        whole = self.square / FROM_NOISE**2
+        return math.sqrt(max(whole if variance > SHAKE_CONFIRMED * whole else variance, self.noise) - self.noise)
+
+
+@dataclass(frozen=True)
+class Shake:
+    """Shake across and down, over the views so far."""
+
+    across: Axis = field(default_factory=Axis)
+    down: Axis = field(default_factory=Axis)
+    pairs: int = 0
+
+    def with_change(self, change: SampleChange | None) -> Shake:
+        """The state after the next view; None, or a gap of views, begins a new chain of changes."""
+        if change is None or not 0.5 < change.steps < 1.5 or not math.isfinite(change.across + change.down):
+            return Shake(replace(self.across, last=math.nan), replace(self.down, last=math.nan), self.pairs)
+        figures = (change.across, change.sigma[0]), (change.down, change.sigma[1])
+        across, down = (
+            axis.with_figure(*figure, self.pairs)
+            for axis, figure in zip((self.across, self.down), figures, strict=True)
+        )
+        return Shake(across, down, self.pairs + (not math.isnan(self.across.last)))
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Standard deviations across and down, in pixels."""
+        return self.across.size(self.pairs), self.down.size(self.pairs)
+
 
 SIGMAS = 8.0
 CELLS = 0.02  # share of a cell: least limit of a shake
@@ -33,7 +109,7 @@ class MotionState:
 
 
 @dataclass(frozen=True)
-class MotionCheck:
+class MotionCheck(Logged):
     """Score: displacement of the sample in pixels, beyond its rotation; steps of the stage if it is a slip.
 
     Only the view of the jump is flagged: later views are as good as earlier ones, but show another position.
@@ -47,7 +123,6 @@ class MotionCheck:
     bit: ClassVar[int] = 9
     unit: ClassVar[str] = "pixels, or steps of the stage"
     meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
-    policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[
         float, pydantic.Field(ge=0, description="pixels by which the sample may shift between two views")

@@ -13,7 +13,6 @@ import numpy as np
 from beamline.monitor.flats_with_sample import (
     BLOCK_SIGMAS,
     OddFrame,
-    Places,
     lit_views,
     noise_of,
     outshone,
@@ -31,7 +30,10 @@ from beamline.monitor.references import (
     ReferenceFrame,
     ReferenceLimits,
     is_blank,
+    level,
+    offset,
     saturation_limit,
+    seconds,
     worst_place,
 )
 from drivers.base.frame import FrameKind
@@ -121,13 +123,13 @@ def _lit_darks(darks: list[list[ReferenceFrame]], flats: list[list[ReferenceFram
     exposures = {_exposure(frame) for group in darks for frame in group}
     for exposure in exposures:
         same = [frame for group in darks for frame in group if _exposure(frame) == exposure]
-        base = min(same, key=_level)
-        lowest = _level(base)
-        levels = [_level(frame) for group in flats for frame in group if not is_blank([frame])]
-        light = (max(levels) if levels else max(map(_level, same))) - lowest
+        base = min(same, key=lambda frame: level([frame]))
+        lowest = level([base])
+        levels = [level([frame]) for group in flats for frame in group if not is_blank([frame])]
+        light = (max(levels) if levels else max(level([frame]) for frame in same)) - lowest
         limit = max(LIT * light, BLOCK_SIGMAS * noise_of(base.blocks))
         for frame in same:
-            above = _level(frame) - lowest
+            above = level([frame]) - lowest
             if above > limit:
                 sentence = (
                     f"there is light in them, or their offset moved: {{figures}} counts above the darkest dark, frame "
@@ -142,8 +144,8 @@ def _changed(
 ) -> list[OddFrame]:
     """Flats with other light than most of their group; where half of the group differs, it has no right light."""
     odd = []
-    offset = _offset(darks)
-    of_all = [[(frame.blocks - offset) / _seconds(frame) for frame in group] for group in flats]
+    base = offset([frame for group in darks for frame in group])
+    of_all = [[(frame.blocks - base) / seconds(frame) for frame in group] for group in flats]
     bright = [max(float(np.nanpercentile(each, BRIGHT)) for each in light) for light in of_all]
     for group, light, most in zip(flats, of_all, bright, strict=True):
         if len(group) < 2 or not most > UNLIT * max(0.0, *bright):
@@ -159,15 +161,15 @@ def _changed(
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2
         flickers, changed = [], []
-        for frame, dark, level, off, other in zip(group, unlit, levels, far, place, strict=True):
+        for frame, dark, share, off, other in zip(group, unlit, levels, far, place, strict=True):
             if dark:
                 sentence = f"{{figures}} of the light of the group's brightest (limit {UNLIT:g}): no beam in them."
-                changed.append(OddFrame(frame, FaultKind.NO_BEAM, max(float(level), 0.0), UNLIT, sentence))
+                changed.append(OddFrame(frame, FaultKind.NO_BEAM, max(float(share), 0.0), UNLIT, sentence))
             elif uneven and off:
                 sentence = (
                     f"{{figures}} times the light of the usual flat of their group (limit 1 +- {limits.uneven:g})."
                 )
-                flickers.append(OddFrame(frame, FaultKind.UNEVEN, float(level), 1 + limits.uneven, sentence))
+                flickers.append(OddFrame(frame, FaultKind.UNEVEN, float(share), 1 + limits.uneven, sentence))
             elif other > (limit := max(limits.uneven, CHANGE_SIGMAS * noise)):
                 sentence = (
                     "in places their light differs from the usual flat of their group by a share of {figures} (limit "
@@ -179,18 +181,5 @@ def _changed(
     return odd
 
 
-def _level(frame: ReferenceFrame) -> float:
-    return float(np.nanpercentile(frame.blocks, BRIGHT))
-
-
-def _offset(darks: list[list[ReferenceFrame]]) -> Places | float:
-    frames = [frame.blocks for group in darks for frame in group]
-    return 0.0 if not frames else np.asarray(np.mean(frames, axis=0), np.float32)
-
-
 def _exposure(frame: ReferenceFrame) -> float:
     return round(frame.exposure, 6) if frame.exposure > 0 else 0.0
-
-
-def _seconds(frame: ReferenceFrame) -> float:
-    return frame.exposure if frame.exposure > 0 else 1.0

@@ -16,7 +16,7 @@ import pydantic
 import scipy
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
@@ -73,7 +73,7 @@ class OppositeState:
 
 
 @dataclass(frozen=True)
-class OppositeCheck:
+class OppositeCheck(Logged):
     """Score: motion of the sample in pixels, or the motion of all of it that would change the view equally.
 
     The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
@@ -86,7 +86,6 @@ class OppositeCheck:
     meaning: ClassVar[str] = (
         "the view from the other side, or the same view before, shows the sample elsewhere or changed"
     )
-    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, pydantic.Field(ge=0, description="pixels by which the sample may have moved or changed")] = (
         0.5
@@ -110,11 +109,7 @@ class OppositeCheck:
             why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
             advice = f"Views from opposite sides are not compared: {why}."
             return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
-        kept = tuple(one for one in state.kept if one.view.index != frame.replaces)  # the replaced view had an alarm
-        if kept and kept[-1].after is None:
-            kept = (*kept[:-1], replace(kept[-1], after=view)) if context.follows else kept[:-1]
-        elif len(kept) < MOST and all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept):
-            kept = (*kept, Kept(view))
+        kept = _with_view(state.kept, view, frame.replaces, follows=context.follows)
         state = replace(state, kept=kept)
         for at, one in enumerate(kept):
             turn = _folded(view.angle - one.view.angle)
@@ -178,6 +173,15 @@ class OppositeCheck:
             "recon`. A sample that crept or changed is followed by `beamline recon --time N`; or scan again, faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
+
+
+def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
+    """The views kept after the next one, which gives the last of them its velocity, or is kept itself."""
+    kept = tuple(one for one in kept if one.view.index != replaces)  # the replaced view had an alarm
+    if kept and kept[-1].after is None:
+        return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]
+    apart = all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept)
+    return (*kept, Kept(view)) if len(kept) < MOST and apart else kept
 
 
 def _folded(angle: float) -> float:

@@ -173,7 +173,7 @@ def judge(
     limits = limits or ReferenceLimits()
     numbers = [group for group in groups if not is_blank(group)]
     views = [view for view in views if not is_blank([view])]
-    base = min((group for group in numbers if group[0].kind is FrameKind.DARK), key=_level, default=None)
+    base = min((group for group in numbers if group[0].kind is FrameKind.DARK), key=level, default=None)
     flats = [group for group in numbers if group[0].kind is FrameKind.FLAT]
     known = [group for group in flats if _saturated(group, base, limits) is None] or flats
     bright = max(known, key=lambda group: _light(group, base), default=None)
@@ -184,14 +184,20 @@ def judge(
         elif group[0].kind is FrameKind.DARK:
             faults = [] if bright is None else [_lit(group, bright, base or group, limits)]
         else:
-            faults = [_saturated(group, base, limits), _without_beam(group, base, bright or group, limits)]
-            if not any(faults):
-                faults = [_outshone(group, base, views, limits)]
-            if not any(faults):
-                faults = [_uneven(group, base, limits), _unlit(group, base, limits)]
+            faults = _of_flats(group, base, bright or group, views, limits)
         rows = tuple(reference.row for reference in group)
         judged.append(GroupVerdict(group[0].kind, rows, tuple(fault for fault in faults if fault is not None)))
     return tuple(judged)
+
+
+def _of_flats(
+    flats: Group, darks: Group | None, bright: Group, views: Group, limits: ReferenceLimits
+) -> list[ReferenceFault | None]:
+    """The faults of a group of flats; the later ones mean nothing where there is an earlier one."""
+    faults = [_saturated(flats, darks, limits), _without_beam(flats, darks, bright, limits)]
+    if not any(faults):
+        faults = [_outshone(flats, darks, views, limits)]
+    return faults if any(faults) else [_uneven(flats, darks, limits), _unlit(flats, darks, limits)]
 
 
 def is_blank(group: Group) -> bool:
@@ -210,12 +216,12 @@ def photons(flats: Group, darks: Group) -> float | None:
     Photon transfer (Janesick 2007), of what changes from frame to frame between neighbouring blocks: a beam that
     flickers or moves is no noise. None where frames or blocks are too few, or the flats have no noise by their light.
     """
-    light = np.mean([flat.blocks for flat in flats], axis=0) - _offset(darks)
+    light = np.mean([flat.blocks for flat in flats], axis=0) - offset(darks)
     lit = light > UNLIT * float(np.nanpercentile(light, BRIGHT))
     beside = lit[:, 1:] & lit[:, :-1]
     if len(flats) < 2 or (len(flats) - 1) * beside.sum() < LEAST_BLOCKS:
         return None
-    levels = np.array([np.median((flat.blocks - _offset(darks))[lit]) for flat in flats])
+    levels = np.array([np.median((flat.blocks - offset(darks))[lit]) for flat in flats])
     even = np.stack([flat.blocks for flat in flats]) * (levels.mean() / levels)[:, None, None].astype(np.float32)
     change = np.diff(np.diff(even, axis=0), axis=2)[:, beside]
     squares = change.astype(np.float64) ** 2
@@ -240,7 +246,7 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
     elif written:
         score, what = (
             1.0,
-            f"every pixel of them holds {_level(flats):g}, though those of the darks vary: counts end there.",
+            f"every pixel of them holds {level(flats):g}, though those of the darks vary: counts end there.",
         )
     else:
         return _clipped(flats, darks, limits)
@@ -282,10 +288,10 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
     if darks is None:
         return None
     if not _has_light(flats, darks, limits):
-        light, noise = _level(flats) - _level(darks), max(_noise(darks), darks[0].rounding)
+        light, noise = level(flats) - level(darks), max(_noise(darks), darks[0].rounding)
         sentence = (
-            f"there is no beam in them: their level {_level(flats):.6g} is {light:.3g} above the darks' "
-            f"{_level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
+            f"there is no beam in them: their level {level(flats):.6g} is {light:.3g} above the darks' "
+            f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
             "Was the shutter open for them, and closed for the darks?"
         )
         return ReferenceFault(FaultKind.NO_BEAM, light / noise if noise else 0.0, limits.light_over_noise, sentence)
@@ -320,7 +326,7 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     """The light of each flat against the group's mean, as a whole and place by place."""
     if len(flats) < 2:
         return None
-    light = np.stack([(flat.blocks - _offset(darks)) / _seconds(flat) for flat in flats])
+    light = np.stack([(flat.blocks - offset(darks)) / seconds(flat) for flat in flats])
     mean = light.mean(axis=0)
     lit = mean > max(0.0, UNLIT * float(np.nanpercentile(mean, BRIGHT)))
     if not lit.any():
@@ -329,13 +335,13 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refer
     levels = np.median(ratio, axis=1)
     local = np.abs(ratio / levels[:, None] - 1)
     noise = median_deviation(local)
-    level = float(np.ptp(levels))
+    changed = float(np.ptp(levels))
     place = float(worst_place(local).max())
-    if level > limits.uneven:
+    if changed > limits.uneven:
         sentence = (
-            f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
+            f"their light changes by {changed:.0%} from flat to flat (limit {limits.uneven:.0%}): an unstable beam."
         )
-        return ReferenceFault(FaultKind.UNEVEN, level, limits.uneven, sentence)
+        return ReferenceFault(FaultKind.UNEVEN, changed, limits.uneven, sentence)
     if place > max(limits.uneven, CHANGE_SIGMAS * noise):
         sentence = (
             f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
@@ -352,7 +358,7 @@ def worst_place(changes: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
-    light = np.mean([flat.blocks - _offset(darks) for flat in flats], axis=0)
+    light = np.mean([flat.blocks - offset(darks) for flat in flats], axis=0)
     score = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean())
     if score <= limits.unlit:
         return None
@@ -366,18 +372,18 @@ def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refere
 def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> ReferenceFault | None:
     if not _has_light(flats, base, limits):
         return None  # both have the same light: the flats' fault reports it, because the wrong one is unknown
-    level = _level(darks) / _level(flats) if _level(flats) > 0 else np.inf
+    share = level(darks) / level(flats) if level(flats) > 0 else np.inf
     noise, of_flats = _noise(darks), _noise(flats)
     known = of_flats > 0  # otherwise the frames have no noise, as only simulated ones
-    variance = (noise / of_flats) ** 2 if known else level
-    score = min(level, variance)
+    variance = (noise / of_flats) ** 2 if known else share
+    score = min(share, variance)
     limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)
-    if known and noise < READOUT and _level(flats) - _level(darks) < FEW * noise:
+    if known and noise < READOUT and level(flats) - level(darks) < FEW * noise:
         return None
-    if score <= limit or _level(darks) <= 0:
+    if score <= limit or level(darks) <= 0:
         return None
     sentence = (
-        f"there is light in them: their level {_level(darks):.6g} is {level:.0%} of the flats' {_level(flats):.6g}"
+        f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' {level(flats):.6g}"
         + (f" and their variance {variance:.0%}" if known else "")
         + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
     )
@@ -385,26 +391,26 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Re
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
-    return _level(flats) - _level(darks) > limits.light_over_noise * max(_noise(darks), darks[0].rounding)
+    return level(flats) - level(darks) > limits.light_over_noise * max(_noise(darks), darks[0].rounding)
 
 
-def _level(group: Group) -> float:
+def level(group: Group) -> float:
     """Counts of the bright part of a frame: a beam may be narrower than the detector."""
     return float(np.median([np.nanpercentile(reference.blocks, BRIGHT) for reference in group]))
 
 
-def _offset(darks: Group | None) -> NDArray[np.float32] | float:
-    return 0.0 if darks is None else np.asarray(np.mean([dark.blocks for dark in darks], axis=0))
+def offset(darks: Group | None) -> NDArray[np.float32] | float:
+    return np.asarray(np.mean([dark.blocks for dark in darks], axis=0)) if darks else 0.0
 
 
-def _seconds(reference: ReferenceFrame) -> float:
+def seconds(reference: ReferenceFrame) -> float:
     return reference.exposure if reference.exposure > 0 else 1.0
 
 
 def _light(group: Group, darks: Group | None) -> float:
     """Counts above the darks, a second where the exposure is known."""
-    offset = 0.0 if darks is None else _level(darks)
-    return float(np.median([(np.nanpercentile(flat.blocks, BRIGHT) - offset) / _seconds(flat) for flat in group]))
+    dark = 0.0 if darks is None else level(darks)
+    return float(np.median([(np.nanpercentile(flat.blocks, BRIGHT) - dark) / seconds(flat) for flat in group]))
 
 
 def _noise(group: Group) -> float:

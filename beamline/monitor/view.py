@@ -3,19 +3,26 @@
 Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
 takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share
 of the field.
+
+Spots are bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers): the largest pixel of
+a preview block if it is far brighter than the means of all blocks around it, beyond noise. It must also exceed that
+place in the previous frame, because hot pixels and bright gaps in the sample stay.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
+from beamline.monitor.digest import FrameDigest, block_side
+from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
-from recon.base.jit import njit
 
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
@@ -104,11 +111,13 @@ def grid_of(
 def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
     """A projection on the grid; `more_light`: its exposure over that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
-    depth, weight = np.empty_like(counts), np.empty_like(counts)
-    scale = np.float32(1.0 / more_light)
-    _line_integrals(
-        counts, grid.dark, grid.full, grid.lit, scale, np.float32(DARKEST * (1 if grid.flats else 1e3)), depth, weight
-    )
+    darkest = np.float32(DARKEST * (1 if grid.flats else 1e3))
+    through = np.maximum((counts - grid.dark) / grid.full * np.float32(1.0 / more_light), darkest)
+    lit = (grid.lit > 0) & ~np.isnan(through)
+    weight = np.where(lit, np.minimum(through, 1), 0)
+    depth = np.where(lit, -np.log(through), 0)
+    gap = ~lit[:, 1:-1] & lit[:, :-2] & lit[:, 2:]
+    depth[:, 1:-1][gap] = 0.5 * (depth[:, :-2] + depth[:, 2:])[gap]
     left, right = depth[:, grid.left : grid.left + EDGE], depth[:, grid.right + 1 - EDGE : grid.right + 1]
     edges = float(np.median(left)), float(np.median(right))
     return CellView(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
@@ -139,7 +148,7 @@ def brightest_place(view: CellView, grid: CellGrid) -> float:
     """Mean line integral of the brightest place of the lit field: 0 in air."""
     depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
     down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
-    sums, cells = (_places(part, down, across) for part in (depth, lit))
+    sums, cells = (sums_of_places(part, down, across) for part in (depth, lit))
     means = sums[cells > 0] / cells[cells > 0]
     return float(means.min()) if means.size else 0.0
 
@@ -163,8 +172,8 @@ def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
     return min(before, max(now, 0.0)) if before > 0 else before
 
 
-def _places(image: CellValues, down: int, across: int) -> CellValues:
-    """Sums over a grid of places."""
+def sums_of_places(image: CellValues, down: int, across: int) -> CellValues:
+    """Sums over a grid of so many places."""
     rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
 
@@ -177,45 +186,65 @@ def cell_noise(depth: CellValues, weight: CellValues) -> float:
 
 def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, CellValues, CellValues]:
     """Means of the cells, and of each preview row and column."""
-    rows, cols = preview.shape
-    cells = np.zeros((rows // blocks, cols // blocks), np.float32)
-    row_mean, col_mean = np.empty(rows, np.float32), np.zeros(cols, np.float32)
-    _bin(preview, blocks, cells, row_mean, col_mean)
-    return cells, row_mean, col_mean
+    rows, cols = (n // blocks for n in preview.shape)
+    # Faster than sums over a short axis.
+    lines = reduce(np.add, (preview[k : rows * blocks : blocks] for k in range(blocks)))
+    cells = reduce(np.add, (lines[:, k : cols * blocks : blocks] for k in range(blocks))) / np.float32(blocks * blocks)
+    return cells, preview.mean(axis=1), preview.mean(axis=0)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _bin(preview, blocks, cells, row_mean, col_mean):
-    rows, cols = preview.shape
-    for row in range(rows):
-        line = preview[row]
-        total = np.float32(0)
-        for col in range(cols):
-            total += line[col]
-            col_mean[col] += line[col]
-        row_mean[row] = total / cols
-        if row < cells.shape[0] * blocks:
-            out = cells[row // blocks]
-            for cell in range(out.size):
-                part = np.float32(0)
-                for col in range(cell * blocks, (cell + 1) * blocks):
-                    part += line[col]
-                out[cell] += part
-    cells /= np.float32(blocks * blocks)
-    col_mean /= np.float32(rows)
+NOISES = 4.0  # times the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
+RELATIVE = 0.25  # share of the light around it: least excess of a spot; less leaves only a faint streak
+SAMPLES = 4096  # blocks that give the usual excess
+MOST = 4096  # most spots whose places are kept
 
 
-@njit(nogil=True, cache=True)
-def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):
-    for row in range(counts.shape[0]):
-        for col in range(counts.shape[1]):
-            through = max((counts[row, col] - dark[row, col]) / full[row, col] * scale, darkest)
-            if lit[row, col] > 0 and through == through:
-                depth[row, col] = -np.log(through)
-                weight[row, col] = min(through, np.float32(1))
-            else:
-                depth[row, col] = 0.0
-                weight[row, col] = 0.0
-        for col in range(1, counts.shape[1] - 1):
-            if weight[row, col] == 0 and weight[row, col - 1] > 0 and weight[row, col + 1] > 0:
-                depth[row, col] = 0.5 * (depth[row, col - 1] + depth[row, col + 1])
+class Spots(NamedTuple):
+    """The spots of a frame: their number, and how many saturated pixels they hold."""
+
+    n: int = 0
+    saturated: int = 0
+
+
+NO_SPOTS = Spots()
+
+
+def spots_of(
+    frame: Frame, digest: FrameDigest, before: FrameDigest | None, dark: NDArray[np.float32] | None, saturation: float
+) -> Spots:
+    """The spots of a view or a flat, given the frame before it and the preview of the darks."""
+    if before is None or frame.kind is FrameKind.DARK or digest.preview.shape != before.preview.shape:
+        return NO_SPOTS
+    every = max(1, digest.preview.size // SAMPLES)
+    base = 0.0 if dark is None else float(np.median(dark.ravel()[::every]))
+    mean, peak = digest.preview.ravel()[::every], digest.peaks.ravel()[::every]
+    usual = float(np.median((peak - mean) / np.sqrt(np.maximum(mean - base, 1))))
+    if not usual > 0:  # blocks of one pixel, or frames without noise
+        return NO_SPOTS
+    places = _isolated(digest, before.peaks, base, NOISES * usual)
+    size = block_side(frame.counts.shape, digest.preview.shape)
+    saturated = 0
+    for row, col in places[:MOST]:
+        if digest.peaks[row, col] >= saturation:
+            block = frame.counts[row * size : (row + 1) * size, col * size : (col + 1) * size]
+            saturated += int((block >= saturation).sum())
+    return Spots(len(places), saturated)
+
+
+def _isolated(digest: FrameDigest, before: NDArray[np.float32], dark: float, noises: float) -> NDArray[np.intp]:
+    """Rows and columns [block, 2] of the blocks with a spot."""
+    rise = digest.peaks - digest.preview
+    far = np.flatnonzero(rise * rise > noises**2 * np.maximum(digest.preview - dark, 1))
+    rows, cols = np.divmod(far, rise.shape[1])
+    (beside, was), peaks = (_around(image, rows, cols) for image in (digest.preview, before)), digest.peaks[rows, cols]
+    around = np.delete(beside, 4, axis=1).max(axis=1)  # without the block itself
+    light = np.maximum(around - dark, 1)
+    bright = peaks - around > np.maximum(noises * np.sqrt(light), RELATIVE * light)
+    new = was.max(axis=1) - around < 0.5 * (peaks - around)
+    return np.stack([rows, cols], axis=1)[bright & new]
+
+
+def _around(image: NDArray[np.float32], rows: NDArray[np.intp], cols: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Values [place, 9] of the 3 x 3 blocks about some places; 0 beyond the edges."""
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(image, 1), (3, 3))
+    return windows[rows, cols].reshape(-1, 9)

@@ -17,15 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
-from beamline.monitor.change import MOST_STEPS, SPAN, change_of
+from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
 from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side, digests
-from beamline.monitor.pixels import PixelsCheck
-from beamline.monitor.scatter import running_mean
-from beamline.monitor.shake import Shake
-from beamline.monitor.spots import NO_SPOTS, spots_of
-from beamline.monitor.view import CellView, dimmer_than_flats, grid_of, light_left, view_of
+from beamline.monitor.field import PixelsCheck
+from beamline.monitor.motion import Shake
+from beamline.monitor.view import NO_SPOTS, CellView, dimmer_than_flats, grid_of, light_left, spots_of, view_of
 from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`

@@ -47,19 +47,15 @@ class Recording:
             raise _foreign(path)
         with hdf5.opened_itself(path) if alone else nullcontext():
             self._file = hdf5.open_hdf5(path, follow=True)
-        try:
+        with hdf5.closed_on_error(self), hdf5.readable(path):
             if alone:
                 require_inside(self._file)
-            with hdf5.readable(path):
-                if layout.COMMITTED not in self._file:
-                    raise _foreign(path)
-                self._data: h5py.Dataset = self._file[layout.DATA]
-                self._preview: h5py.Dataset = self._file[layout.PREVIEW]
-                self.shape = (int(self._data.shape[1]), int(self._data.shape[2]))
-                self.preview_bin = int(self._preview.attrs["bin"])
-        except BaseException:
-            self.close()
-            raise
+            if layout.COMMITTED not in self._file:
+                raise _foreign(path)
+            self._data: h5py.Dataset = self._file[layout.DATA]
+            self._preview: h5py.Dataset = self._file[layout.PREVIEW]
+            self.shape = (int(self._data.shape[1]), int(self._data.shape[2]))
+            self.preview_bin = int(self._preview.attrs["bin"])
         self._dark_and_flat: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
     def close(self) -> None:

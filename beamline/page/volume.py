@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,28 +32,7 @@ _SAMPLE = 2_000_000  # values that show the histogram as well as all do
 _Piece = tuple[NDArray[Any], TileRegion, int]
 
 
-class VolumeSlices(Protocol):
-    """Slices of a volume. All calls come from one thread (HDF5)."""
-
-    @property
-    def bin(self) -> int:
-        """Binning of slices across y and x, however far one zooms in."""
-
-    @property
-    def ready(self) -> float:
-        """The share of the copy that has been read."""
-
-    def read_more(self) -> bool:
-        """Read one more slice of the copy; False: there is no more."""
-
-    def part(self, axis: int, index: int, region: TileRegion) -> _Piece:
-        """A part of a slice with at least what the region shows; the region of this part, and its binning."""
-
-    def sample(self) -> NDArray[Any]:
-        """Values that stand for all, flat; all of them where they are few."""
-
-
-def slices_of(path: Path, values: Any, held: int) -> VolumeSlices:
+def slices_of(path: Path, values: Any, held: int) -> ScaledSlices | CopiedSlices:
     """Slices of the voxels in a file."""
     if isinstance(values, VolumeScale) and 4 * math.prod((values, *values.coarser)[-1].shape) <= held:
         return ScaledSlices(values)
@@ -61,7 +40,8 @@ def slices_of(path: Path, values: Any, held: int) -> VolumeSlices:
 
 
 class ScaledSlices:
-    """Of a file with scales: the one that a tile needs, or a coarser one where that reads over `SLICE_READ_BYTES`."""
+    """Slices of a file with scales: the one that a tile needs, or a coarser one where that reads over
+    `SLICE_READ_BYTES`. Methods as of CopiedSlices. All calls come from one thread (HDF5)."""
 
     bin, ready = 1, 1.0
 
@@ -95,8 +75,12 @@ class ScaledSlices:
 
 
 class CopiedSlices:
-    """Of a file whose slices across y and x are spread over all of it: these come from a copy, those across z from
-    the file. The copy is read a slice at a time, first a few from all over the volume, then those between them."""
+    """Slices of a file whose slices across y and x are spread over all of it: these come from a copy, those across z
+    from the file. The copy is read a slice at a time, first a few from all over the volume, then those between them.
+
+    Attributes:
+        bin: binning of slices across y and x, however far one zooms in.
+    """
 
     def __init__(self, path: Path, values: Any, held: int) -> None:
         self._path, self._values = path, values
@@ -111,9 +95,11 @@ class CopiedSlices:
 
     @property
     def ready(self) -> float:
+        """The share of the copy that has been read."""
         return float(self._filled.mean())
 
     def read_more(self) -> bool:
+        """Read one more slice of the copy; False: there is no more."""
         z = next(self._waiting, None)
         if z is None:
             return False
@@ -122,6 +108,7 @@ class CopiedSlices:
         return True
 
     def part(self, axis: int, index: int, region: TileRegion) -> _Piece:
+        """A part of a slice with at least what the region shows; the region of this part, and its binning."""
         rows, cols = (n for i, n in enumerate(self._values.shape) if i != axis)
         shown, whole = region.inside((rows, cols)), TileRegion(0, rows, 0, cols)
         if axis == 0:
@@ -132,6 +119,7 @@ class CopiedSlices:
         return (values[shown.slices], shown, 1) if self.bin == 1 else (values, whole, self.bin)
 
     def sample(self) -> NDArray[Any]:
+        """Values that stand for all, flat; all of them where they are few."""
         step = max(1, math.isqrt(int(self._filled.sum()) * self._copy[0].size // _SAMPLE))
         return self._copy[:, ::step, ::step][self._filled].reshape(-1)
 
@@ -304,7 +292,7 @@ class ShownVolume:
     def _numbers(self, name: str) -> list[float]:
         return list(np.asarray(self._parameters.get(name, ()), np.float64).tolist())
 
-    def _at(self, time: int) -> VolumeSlices:
+    def _at(self, time: int) -> ScaledSlices | CopiedSlices:
         """At one of the times; a volume that does not change is the same at all."""
         return self._slices[min(time, len(self._slices) - 1)]
 

@@ -16,7 +16,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.storage.recon_record import Value
-from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 from recon.base.geometry import arrays_of
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState

@@ -19,7 +19,7 @@ from beamline.reconstruct.outcome import (
     odd_views_warning,
     stray_mass_warning,
 )
-from beamline.storage.scratch import scratch_array
+from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
 from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import count, size
 from beamline.projections.corrections.poses import stated_poses
-from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.step import StepMemory
@@ -23,7 +20,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method, candidates_of, volumes_of
 from recon.base.registry import in_folders
-from recon.base.volume import Grid, Slab
+from recon.base.volume import Grid
 from recon.base.work import CostedMethod
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
@@ -171,12 +168,6 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
     )
 
 
-def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
-    """Whether it is known before reading that rays have weights, as of turned views."""
-    turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
-    return turned and not options.method.traits.direct
-
-
 def memory_of(options: ReconOptions) -> int:
     """Bytes that this process may use, and each worker on this machine or job of Slurm."""
     if options.memory is not None:
@@ -236,15 +227,6 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
         f"{size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if there is as much, "
         f"or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
     )
-
-
-def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: ReconMemory, memory: int) -> None:
-    """Raises DataError if the slabs of a partial volume do not fit."""
-    if (wanted := needs.slab(slabs[0].own.stop)) > memory:
-        raise DataError(
-            f"The slabs of {path} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
-            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
-        )
 
 
 def cluster() -> Any:

@@ -5,6 +5,7 @@ A run follows the plan that its dry run states.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from beamline.core.machine import Need
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.core.text import size
+from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import DiskBuffer, prepare_projections, refuse_spilled
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, cone_of
@@ -27,10 +29,8 @@ from beamline.reconstruct.memory import (
     memory_of,
     recon_memory_of,
     refuse_few_views,
-    refuse_slabs,
     refuse_smallest,
     refuse_whole,
-    surely_weighted,
 )
 from beamline.reconstruct.options import (
     OutputPaths,
@@ -42,9 +42,9 @@ from beamline.reconstruct.options import (
 )
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import refuse_impossible, refuse_views
+from beamline.storage.disk_file import scratch_array
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
@@ -104,7 +104,8 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
             "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
         )
     refuse_whole(source, options, needs, allowed)
-    needs = replace(needs, weighted=surely_weighted(source, options))
+    turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
+    needs = replace(needs, weighted=turned and not options.method.traits.direct)  # other weights are not known yet
     return _in_slabs(source, options, needs, allowed)
 
 
@@ -170,7 +171,11 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
         raise DataError(f"{partial} is of {slabs[-1].own.stop} slices, this volume has {slices}.")
-    refuse_slabs(partial, slabs, needs, allowed)
+    if (wanted := needs.slab(slabs[0].own.stop)) > allowed:
+        raise DataError(
+            f"The slabs of {partial} take {size(wanted)} of memory, {size(allowed)} may be used. Give --memory "
+            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+        )
     return _plan(options, needs, allowed, slabs, missing)
 
 

@@ -20,7 +20,7 @@ from beamline.projections.prepared import PreparedProjections, with_held_out
 from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
-from beamline.storage.scratch import scratch_array
+from beamline.storage.disk_file import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text

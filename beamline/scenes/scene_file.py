@@ -23,8 +23,8 @@ from beamline.storage import hdf5
 from recon.base.geometry import Geometry
 from recon.base.registry import in_folders, unknown
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import Scene, load_scene
 

@@ -1,9 +1,13 @@
-"""Files under HDF5, for its driver `fileobj`: DiskFile, to write; GrowingFile, to read beside its writer."""
+"""Files on a disk: under HDF5 for its driver `fileobj`, scratch arrays without a name, and fsync in a thread."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
+import tempfile
+import threading
+import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from io import SEEK_CUR, SEEK_END, SEEK_SET, FileIO
@@ -11,9 +15,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 from weakref import WeakSet
 
+import numpy as np
+from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
+from beamline.core.errors import DataError
 from beamline.core.files import to_disk
+from beamline.core.text import size
 from beamline.storage.superblock import Superblock, made_whole
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
@@ -193,3 +201,107 @@ class DiskFile(UnderHdf5):
         while n > 0 and (got := self._file.readinto(block[: min(n, _BLOCK)])):
             checksum, n = zlib_ng.crc32(block[:got], checksum), n - got
         return checksum
+
+
+def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Float32 zeros of this shape that lie on the disk of `folder`, as a memory map.
+
+    Raises:
+        DataError: the disk has not so much space.
+    """
+    wanted = 4 * int(np.prod(shape, dtype=np.int64))
+    with tempfile.TemporaryFile(dir=folder) as file:  # the map keeps it open
+        reserve(file.fileno(), wanted, folder)
+        return np.memmap(file, np.float32, "r+" if os.fstat(file.fileno()).st_size == wanted else "w+", shape=shape)
+
+
+def reserve(descriptor: int, wanted: int, folder: Path) -> None:
+    """Take so many bytes for an open file in the folder where the system can. Missing space is then found now, not in
+    the middle of the work.
+
+    Raises:
+        DataError: the disk has not so much space.
+    """
+    there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
+    taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
+    refusal = (
+        f"{folder} has {size(free)} free, and {size(wanted - taken)} more are needed while the volume is made. Write "
+        "the output to another disk. Nothing was written."
+    )
+    if wanted - taken > free:
+        raise DataError(refusal)
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(descriptor, 0, wanted)
+        except OSError as error:
+            raise DataError(refusal) from error
+
+
+SECONDS = 1.0  # between two calls, at least
+
+_PATIENCE = 60.0  # s that the last calls may take
+
+
+class ToDisk:
+    """Calls `to_disk` in a thread, one call at a time, so that a writer need not wait for the disk.
+
+    The thread is a daemon: a disk that hangs does not keep the program from ending.
+
+    Attributes:
+        failed: the disk did not take what a call was for.
+        rows: written to the file before the last call that succeeded.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self._handle = handle
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+        self.rows = 0
+        self._begun = time.monotonic()
+
+    @property
+    def failed(self) -> bool:
+        return self._error is not None
+
+    def __call__(self, rows: int) -> None:
+        """Begin a call, unless one is under way or began less than SECONDS ago.
+
+        Raises:
+            OSError: the disk did not take what an earlier call was for.
+        """
+        if self._error is not None:
+            raise self._error
+        under_way = self._thread is not None and self._thread.is_alive()
+        if under_way or time.monotonic() - self._begun < SECONDS:
+            return
+        self._begun = time.monotonic()
+        self._thread = self._call(rows)
+        self._thread.start()
+
+    def finish(self, rows: int) -> None:
+        """Wait until everything is on the disk.
+
+        Raises:
+            OSError: it did not take it, or not within a minute a call.
+        """
+        for last in (self._thread, self._call(rows)):
+            if last is None:
+                continue
+            if not last.ident:
+                last.start()
+            last.join(_PATIENCE)
+            if last.is_alive():
+                self._error = OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
+            if self._error is not None:
+                raise self._error
+
+    def _call(self, rows: int) -> threading.Thread:
+        def run() -> None:
+            try:
+                to_disk(self._handle)
+            except OSError as error:
+                self._error = error
+            else:
+                self.rows = rows
+
+        return threading.Thread(target=run, name="to disk", daemon=True)

@@ -96,18 +96,23 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
             f"{path} holds {finest.dtype} of shape {finest.shape}; expected real numbers [z, y, x], of one time and "
             "one channel. Copy one to a file of its own."
         )
-    coarser = [array for array in coarser if is_halved(finest.shape[-3:], array)]
-    for array in (finest, *coarser):
-        try:
-            shape_of(array.shape[-3:])
-            piece = math.prod(shape_of(array.chunks[-3:], "chunk")) * np.dtype(array.dtype).itemsize
-        except ValueError as error:
-            raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
-        if piece > free_memory():
-            raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
+    scales = [finest, *(array for array in coarser if is_halved(finest.shape[-3:], array))]
+    for array in scales:
+        _require_chunks(path, array)
     if spacing is not None and not all(0 < step < np.inf for step in spacing):
         raise DataError(f"{path} states voxels of {spacing} mm; expected lengths above 0. Nothing was read.")
-    return ZarrScale(path, finest, tuple(ZarrScale(path, array) for array in coarser)), spacing
+    return ZarrScale(path, finest, tuple(ZarrScale(path, array) for array in scales[1:])), spacing
+
+
+def _require_chunks(path: Path, array: Any) -> None:
+    """DataError for an impossible shape, and for chunks that the memory does not hold."""
+    try:
+        shape_of(array.shape[-3:])
+        piece = math.prod(shape_of(array.chunks[-3:], "chunk")) * np.dtype(array.dtype).itemsize
+    except ValueError as error:
+        raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
+    if piece > free_memory():
+        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
 
 
 def _regular_files(path: Path) -> Any:

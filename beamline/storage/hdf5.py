@@ -87,12 +87,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         except (OSError, RuntimeError, ValueError) as error:
             problems.append(error)
             continue
-        try:
-            with readable(path):
-                require_harmless(file)
-        except BaseException:
-            file.close()
-            raise
+        with closed_on_error(file), readable(path):
+            require_harmless(file)
         return file
     raise _unopened(path, follow, head, problems)
 
@@ -235,6 +231,16 @@ def readable(path: Path) -> Iterator[None]:
             f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was "
             f"changed.{limit}"
         ) from error
+
+
+@contextmanager
+def closed_on_error(file: Any) -> Iterator[None]:
+    """Close what the block cannot make use of."""
+    try:
+        yield
+    except BaseException:
+        file.close()
+        raise
 
 
 def reason(error: Exception) -> str:
@@ -482,9 +488,21 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
     return value if np.isfinite(value) else None
 
 
-def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians by the `units` attribute, or by `default` if it is missing; a column becomes a list."""
-    unit = attribute(item, "units") or default
+def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[np.float64] | None:
+    """Numbers in our unit, as a list; None where there is no dataset of real numbers, or its unit is not known."""
+    factor = None if item is None else units.get(attribute(item, "units").lower())
+    if item is None or factor is None or item.dtype.kind not in "uif":
+        return None
+    return np.ravel(np.asarray(values_of(item), np.float64)) * factor
+
+
+def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians; a column becomes a list.
+
+    Args:
+        unit: whatever the attribute `units` says; None: that, or `default` if it is missing.
+    """
+    unit = unit or attribute(item, "units") or default
     factor = ANGLE_UNITS.get(unit.lower())
     if factor is None:
         raise DataError(

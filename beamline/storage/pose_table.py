@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 import zipfile
 import zlib
@@ -16,6 +15,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
+from beamline.core.text import csv_text
 from beamline.storage import hdf5
 from beamline.storage.readers.nexus import choose, find
 from beamline.storage.recon_record import ReconRecord
@@ -296,10 +296,6 @@ def write_poses(path: Path, volume: Path) -> tuple[int, float]:
     assert table.angles_deg is not None
     header = ["frame", "angle_deg", *_PIXELS, *_TURNS, *(_FOR_PEOPLE if mm else ())]
     columns = [table.angles_deg, *table.shifts.T, *table.turns_deg.T, *(table.shifts.T * pixel if mm else ())]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for frame, *values in zip(table.keys, *columns, strict=True):
-        writer.writerow([int(frame), *(repr(float(value)) for value in values)])
-    write_whole(path, text.getvalue())
+    rows = ([int(frame), *map(repr, map(float, values))] for frame, *values in zip(table.keys, *columns, strict=True))
+    write_whole(path, csv_text([header, *rows]))
     return int(table.keys.size), float(parameters["axis_col"])

@@ -94,11 +94,15 @@ class Registry(Mapping[str, T], Generic[T]):
         return len(self._entries)
 
 
+def tables_in_folders(package: str, table: str) -> dict[str, Mapping[str, Any]]:
+    """The dictionaries named `table` of the folders of a package, by folder in the order of their names."""
+    folders = sorted(name for _, name, is_folder in iter_modules(import_module(package).__path__) if is_folder)
+    return {folder: getattr(import_module(f"{package}.{folder}"), table, {}) for folder in folders}
+
+
 def in_folders(package: str, table: str) -> dict[str, Any]:
     """The dictionaries named `table` of the folders of a package, joined in the order of the folders' names."""
-    folders = sorted(name for _, name, is_folder in iter_modules(import_module(package).__path__) if is_folder)
-    modules = (import_module(f"{package}.{folder}") for folder in folders)
-    return {name: entry for module in modules for name, entry in getattr(module, table, {}).items()}
+    return {name: row for rows in tables_in_folders(package, table).values() for name, row in rows.items()}
 
 
 def plugins(

@@ -49,7 +49,7 @@ KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
         "separator": (1.064, {"C3H6": 590 * 0.90, **{salt: 0.41 * mass for salt, mass in _LP30.items()}}),
     }
 )
-"""Density in g/cm³ and parts of the mass; see simulators.samples.materials.palette for the sources."""
+"""Density in g/cm³ and parts of the mass; see simulators.samples.materials.materials for the sources."""
 
 
 _SHELLS = {"K": xraylib.K_SHELL, "L1": xraylib.L1_SHELL, "L2": xraylib.L2_SHELL, "L3": xraylib.L3_SHELL}

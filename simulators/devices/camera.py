@@ -21,9 +21,8 @@ from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, Tr
 from simulators.devices.camera_view import CameraView, Exposed
 from simulators.devices.trigger_line import TriggerLine
 from simulators.effects.chain import Label
-from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION, OFFSET
-from simulators.frame.shot import CannotExposeError
+from simulators.frame.shot import CannotExposeError, Detector
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
 

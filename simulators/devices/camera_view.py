@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from drivers import orca_quest
 from drivers.base.protocols import CameraSettings
-from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION
-from simulators.frame.shot import AngleAt, Shot
+from simulators.frame.shot import AngleAt, Detector, Shot
 from simulators.scenes.scene import Scene
 
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator
 
 from simulators.effects.catalogue import CATALOGUE, FINAL, Domain, class_of, order_error
-from simulators.frame.pose import Pose
-from simulators.frame.shot import Image, Moments, Shot
+from simulators.frame.shot import Image, Moments, Pose, Shot
 
 StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
 """A context that is entered with the name of each step of an exposure, to measure its cost."""
@@ -111,7 +110,7 @@ class Chain:
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
-        """Of an exposure. Without blur there is one, the middle of the exposure, as a reconstruction assumes."""
+        """Moments of an exposure. Without blur there is one, its middle, as a reconstruction assumes."""
         moments = Moments.once(shot.detector.shape[0], shot.exposure / 2)
         for effect in self.effects:
             if isinstance(effect, SamplingEffect):

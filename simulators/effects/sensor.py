@@ -55,7 +55,7 @@ class QuantumEfficiency(ImageEffect):
 
 @dataclass(frozen=True)
 class PhotonNoise(ImageEffect):
-    """Poisson around the expectation; photons are whole numbers afterwards.
+    """Poisson noise around the expected photons, which are whole numbers afterwards.
 
     Detected photons and pixels are independent. Behind a scintillator this holds if few of an X-ray's photons reach
     the same pixel. If g of them reach it, the variance is 1 + g times larger and correlated by the blur (Cunningham,
@@ -72,7 +72,7 @@ FEW = 1.0  # Electrons a pixel: below this, placing single electrons is faster t
 
 @dataclass(frozen=True)
 class DarkCurrent(ImageEffect):
-    """Poisson around the dark current times the exposure.
+    """Electrons without light: Poisson around dark current times exposure.
 
     A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely. This makes
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
@@ -120,7 +120,7 @@ class Saturation(ImageEffect):
 
 @dataclass(frozen=True)
 class ReadNoise(ImageEffect):
-    """Gaussian. Binned pixels are read one by one, so that their variances add up.
+    """Gaussian noise of the readout. Binned pixels are read one by one, so that their variances add up.
 
     Attributes:
         rms: electrons of a sensor pixel, in place of the readout's.
@@ -149,7 +149,7 @@ class ReadNoise(ImageEffect):
 
 @dataclass(frozen=True)
 class Offset(ImageEffect):
-    """The same for any binning (to check on a camera). The photon number readout has no offset.
+    """Offset of the counts, the same for any binning (to check on a camera); none in the photon number readout.
 
     Attributes:
         spread: standard deviation between sensor pixels in counts (normal distribution), about 1 on an ORCA-Quest;

@@ -75,7 +75,7 @@ def choose(where: str, choices: Mapping[str, type[Any]], entry: Any) -> Any:
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Within it a ValueError becomes a SceneError at that path; a SceneError has its path already."""
+    """Turn a ValueError of the block into a SceneError at this path; a SceneError keeps its own."""
     try:
         yield
     except SceneError:

@@ -11,14 +11,16 @@ from recon.base.jit import thread_count
 SMALL = 1 << 16  # Pixels below which threads cost more than they gain
 
 
-def share_rows(work: Callable[[int, int], None], shape: tuple[int, int]) -> None:
+def share_rows(work: Callable[[int, int], None], shape: tuple[int, int], bands: int = 1) -> None:
     """Call `work(first, end)` for bands that cover all rows of a frame of `shape`, in NUMBA_NUM_THREADS threads (by
     default one a core); `work` releases the interpreter's lock. Not numba's own threads: two threads must not use those
-    at once, and a camera is read while other threads compute."""
+    at once, and a camera is read while other threads compute. `bands`: of each thread; several where rows differ in
+    their work."""
     threads = thread_count() if shape[0] * shape[1] > SMALL else 1
     if threads == 1:
         return work(0, shape[0])
-    edges = [shape[0] * k // threads for k in range(threads + 1)]
+    bands *= threads
+    edges = [shape[0] * k // bands for k in range(bands + 1)]
     with ThreadPoolExecutor(threads) as pool:
         for done in [pool.submit(work, first, end) for first, end in pairwise(edges)]:
             done.result()

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 
 
 class Sample(Protocol):

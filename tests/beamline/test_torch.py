@@ -47,7 +47,7 @@ from pathlib import Path
 from beamline.features.page.app import page, viewer
 from beamline.features.page.serve import open_port, start
 from beamline.page.volume import ShownVolume
-import beamline.features.page.watch, beamline.page.recording
+import beamline.features.page.command, beamline.page.recording
 with closing(ShownVolume(Path("fbp.h5"))) as volume:
     start(lambda access: viewer([volume], access), open_port("127.0.0.1", 0)).stop()
 """

@@ -19,7 +19,7 @@ import tifffile
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 

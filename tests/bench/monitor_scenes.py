@@ -24,9 +24,7 @@ from simulators.effects.chain import AnyEffect, Chain, Label
 from simulators.effects.detector.pixels import Zingers
 from simulators.effects.scattering.deflected import Floaters
 from simulators.effects.stage.errors import Jump
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
-from simulators.frame.shot import Image, Shot, fixed_rng
+from simulators.frame.shot import Detector, Image, Pose, Shot, fixed_rng
 from simulators.samples.sample import Sample
 from simulators.scenes.expose import Scan, expose
 from simulators.scenes.scene import Scene, load_scene

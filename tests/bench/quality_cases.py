@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from simulators.samples.voxels.voxels import Voxels

@@ -20,7 +20,7 @@ import numpy as np
 import tifffile
 
 from beamline.storage.writers.recon_file import read_reconstruction
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 

@@ -28,9 +28,9 @@ from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import look, start
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.scan.recorder import Recorder, frames_in_memory
+from beamline.storage.disk_file import ToDisk
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.to_disk import ToDisk
 from drivers import orca_quest
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind

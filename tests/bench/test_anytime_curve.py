@@ -29,7 +29,7 @@ from recon.splatting.stream import StreamingFit
 from recon.voxels.fbp import fbp
 from recon.voxels.projector import Projector
 from recon.warm_up import warm_up
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from tests.clock import SteppedClock

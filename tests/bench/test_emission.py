@@ -11,7 +11,7 @@ import pytest
 
 import recon
 from recon.base.method import Method
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.scenes.emission.counts import NemaPhantom, Scanner, events
 
 SHAPE, VIEWS, PITCH = (16, 64), 120, 1.0  # mm

@@ -18,7 +18,7 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.enough_views import Goal
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.bench.quality_cases import walnut

@@ -15,7 +15,7 @@ import recon
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.voxels.displacement import Displacement, displaced
-from simulators.samples.materials.palette import known
+from simulators.samples.materials.materials import known
 from tests.bench.quality_cases import seen_by_simulator
 
 pytestmark = pytest.mark.bench

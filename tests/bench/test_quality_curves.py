@@ -29,7 +29,7 @@ from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp
 from recon.voxels.held_out import choice_sweeps
 from recon.warm_up import warm_up
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
 from tests.bench.spheres import spheres

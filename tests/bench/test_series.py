@@ -15,7 +15,7 @@ import pytest
 import recon
 from recon.base.arrays import F32
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene
 

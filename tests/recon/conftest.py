@@ -9,7 +9,7 @@ import pytest
 
 from recon.base.kernel import Kernel
 from recon.splatting.gaussians import Gaussians
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.recon.few_views import ANGLES, PITCH, SHAPE, VIEWS

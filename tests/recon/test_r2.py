@@ -15,7 +15,7 @@ from recon.base.kernel import Kernel, RayModel
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS

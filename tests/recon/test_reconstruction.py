@@ -21,7 +21,7 @@ from recon.assess.metrics import psnr
 from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
 from recon.methods import build, by_name, names_of_one_volume
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
 from tests.slow_cases import others_slow

@@ -10,7 +10,7 @@ import pytest
 import recon
 from recon import CorrectionSettings, References
 from recon.prep.align import AxisError, axis_from_opposites
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
 from tests.slow_cases import others_slow

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.samples.bodies.packing import rotation
 from simulators.samples.bodies.solids import (
     Box,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from simulators.effects.chain import PoseEffect
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Pose
 from tests.simulators import shots
 
 

@@ -15,8 +15,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Polyhedron, Solid

@@ -119,7 +119,7 @@ assert left_out == {f"The {kind} 'wrong' {package} (math:pi)" for kind in kinds}
     f"The correction 'air' {package} (site_of_an_instrument.corrections:Lift)",
     f"The effect 'gone' {package} (no_such_module:Gone)",
     f"The method 'fbp' {package} (site_of_an_instrument.methods:Mean)",
-    f"The volume format 'taken' {package} (beamline.storage.volumes.plain:Npy)",
+    f"The volume format 'taken' {package} (beamline.storage.volumes.single_files:Npy)",
 }, left_out
 
 grid = recon.Grid((2, 8, 8), 1.0)
@@ -198,7 +198,7 @@ def test_one_of_each_kind_is_found_by_its_entry_point_and_what_does_not_fit_is_n
             ("splatline.method", "fbp = site_of_an_instrument.methods:Mean"),
             ("splatline.correction", "air = site_of_an_instrument.corrections:Lift"),
             ("splatline.effect", "gone = no_such_module:Gone"),
-            ("splatline.volume_format", "taken = beamline.storage.volumes.plain:Npy"),
+            ("splatline.volume_format", "taken = beamline.storage.volumes.single_files:Npy"),
         ],
     )
     path = os.pathsep.join([str(tmp_path), str(HERE.parents[1])])

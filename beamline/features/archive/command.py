@@ -7,11 +7,9 @@ from pathlib import Path
 import click
 
 from beamline.cli.options import NameChoice, as_scan, json_option
-from beamline.cli.terminal import counting, events_shown
-from beamline.core.events import Done
+from beamline.cli.terminal import answering
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, size, spans
-from drivers.base.clock import SystemClock
 
 _PATH = click.Path(path_type=Path)
 CODECS = ("blosc2", "bitshuffle-zstd", "bitshuffle-lz4")  # The first is the default
@@ -38,28 +36,23 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     """
     from beamline.features.archive.archive import archive as archive_scan
 
-    clock = SystemClock()
-    began = clock.now()
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
-        progress = counting("archive", sink, clock)
-        done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=progress)
-        facts = {**vars(done), "codec": codec, "ratio": done.raw_bytes / done.bytes, "seconds": clock.now() - began}
-        sink(Done(facts, time=clock.now()))
-    if as_json:
-        return
-    click.echo(f"output   {output} ({codec})")
-    click.echo(f"size     {size(done.raw_bytes)} -> {size(done.bytes)}, ratio {facts['ratio']:.2f}")
-    click.echo(f"speed    {done.raw_bytes / max(facts['seconds'], 1e-9) / 1e6:.0f} MB/s, written and compared")
-    verified = f"verified {count(done.frames, 'frame')}, each as in {scan}"
-    if done.damaged:
-        click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept unchanged: {spans(done.damaged)}")
-        verified += f", also its {count(len(done.damaged), 'damaged frame')}"
-    if done.altered:
-        click.echo(
-            f"altered  what {scan} says of frames {spans(done.altered)} is not as it was written; kept unchanged"
+        done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=answer.counting("archive"))
+        ratio, seconds = done.raw_bytes / done.bytes, answer.seconds
+        facts = {**vars(done), "codec": codec, "ratio": ratio, "seconds": seconds}
+        damaged = count(len(done.damaged), "frame")
+        altered = f"what {scan} says of frames {spans(done.altered)} is not as it was written; kept unchanged"
+        raw, *others = map(str, done.sources)
+        answer.done(
+            facts,
+            f"output   {output} ({codec})",
+            f"size     {size(done.raw_bytes)} -> {size(done.bytes)}, ratio {ratio:.2f}",
+            f"speed    {done.raw_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s, written and compared",
+            *([f"damaged  {damaged} of {scan}, kept unchanged: {spans(done.damaged)}"] if done.damaged else []),
+            *([f"altered  {altered}"] if done.altered else []),
+            f"verified {count(done.frames, 'frame')}, each as in {scan}"
+            + (f", also its {count(len(done.damaged), 'damaged frame')}" if done.damaged else ""),
+            f"the raw file may be deleted: {raw}"
+            + (f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""),
         )
-    click.echo(verified)
-    raw, *others = map(str, done.sources)
-    more = f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""
-    click.echo(f"the raw file may be deleted: {raw}{more}")

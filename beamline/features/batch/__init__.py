@@ -1,14 +1,7 @@
 """Batches: many scans reconstructed by one recipe, with a table of what became of each."""
 
-from __future__ import annotations
-
-from beamline.cli.commands import CommandEntry, Libraries
-
 COMMANDS = {
-    "batch": CommandEntry(
-        "beamline.features.batch.command",
-        "Reconstruct many scans by one recipe; a table says what became of each.",
-        Libraries.FITS,
-    ),
+    "batch": ("Reconstruct many scans by one recipe; a table says what became of each.", "FITS"),
 }
+
 COUNTED = {"batch": "scans"}

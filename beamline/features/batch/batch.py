@@ -101,14 +101,14 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
 
 @dataclass(frozen=True, kw_only=True)
 class ScanNeed(Need):
-    """What the reconstruction of a scan will take; `refusal`: why it would fail, empty where it would not."""
+    """Time and memory of the reconstruction of a scan; `refusal`: why it would fail, or empty."""
 
     refusal: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BatchPlan(Need):
-    """What a call would do, and what all scans that wait will take.
+    """Scans that a call would reconstruct, and the time and memory that it would take.
 
     Attributes:
         rows: all rows of the table, with those of this call.
@@ -145,7 +145,7 @@ class BatchPlan(Need):
 
 
 def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) -> BatchPlan:
-    """What `run_batch` would do. Nothing is written, and no frame is read.
+    """Plan `run_batch`: nothing is written, and no frame is read.
 
     Args:
         needs_of: what the reconstruction of a scan file by the recipe takes.
@@ -163,7 +163,7 @@ def planned_batch(options: BatchOptions, needs_of: Callable[[str], ScanNeed]) ->
 
 
 class Worker:
-    """A process that reconstructs one scan after the other; a context manager, which ends it.
+    """A worker process that reconstructs scan after scan; it ends with the context.
 
     After a scan without a volume the next one gets a new process, so that a crash, a lack of memory or leftovers of a
     failure harm no other scan.

@@ -9,18 +9,16 @@ from tempfile import TemporaryDirectory
 
 import click
 
-from beamline.cli.options import dry_option, json_events, json_option
-from beamline.cli.terminal import events_shown
+from beamline.cli.options import dry_option, json_option
+from beamline.cli.terminal import answering
 from beamline.core.errors import BeamlineError, DataError, ScanStopped
-from beamline.core.events import Done
 from beamline.core.files import RECON
 from beamline.core.machine import Need
 from beamline.features.batch.batch import TABLE, BatchOptions, ScanNeed, planned_batch, run_batch
-from drivers.base.clock import SystemClock
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:
-    """The files that names and patterns mean, each once, in the order of the names."""
+    """Files that match names and patterns, each once, in the order given."""
     from beamline.storage.interrupted import scan_file  # here: help needs none of it
 
     scans: dict[Path, None] = {}
@@ -78,24 +76,21 @@ def batch(scans: list[Path], config: Path | None, output: Path, dry: bool, as_js
         from beamline.cli.recon import refuse_recipe  # here: help needs none of it
 
         refuse_recipe(config)
-    options, clock = BatchOptions(scans, config, output), SystemClock()
+    options = BatchOptions(scans, config, output)
     if dry:
         beside = next(folder for folder in output.absolute().parents if folder.is_dir())
         planned = planned_batch(options, partial(_needs_of, config, beside))
-        with json_events(as_json) as sink:
-            sink(Done(planned, time=clock.now()))
-        if not as_json:
-            click.echo("\n".join(planned.lines()))
+        with answering(as_json) as answer:
+            answer.done(planned, *planned.lines())
         return
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         try:
-            rows = run_batch(options, sink, clock)
+            rows = run_batch(options, answer.sink, answer.clock)
         except KeyboardInterrupt as stop:
             raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
         failed = [row for row in rows if not row.has_volume]
         counts = {"done": len(rows) - len(failed), "failed": len(failed), "output": output / TABLE}
-        sink(Done(counts, time=clock.now()))
+        every = [] if failed else [f"{len(rows)} of {len(rows)} scans have a volume: {output / TABLE}"]
+        answer.done(counts, *every)
     if failed:
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
-    if not as_json:
-        click.echo(f"{len(rows)} of {len(rows)} scans have a volume: {output / TABLE}")

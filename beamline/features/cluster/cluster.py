@@ -198,7 +198,7 @@ class Cluster:
         control: RunControl,
         **settings: Any,
     ) -> Reconstruction:
-        """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
+        """Reconstruct on a worker with as many threads as this process has; without progress and stop.
 
         Raises:
             WorkersLostError: several workers were lost with this work, or all workers, or the scheduler.
@@ -261,7 +261,7 @@ def check_cluster(spec: str) -> None:
 
 
 def local_workers(spec: str | None) -> int:
-    """Number of workers on this machine; 0: none, or those of a scheduler."""
+    """Number of workers to start on this machine; 0 where a scheduler has its own."""
     return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0
 
 

@@ -21,7 +21,7 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One result.
+    """Result of one check.
 
     Attributes:
         observed, expected, advice: sentences or parts of them, for people; may be empty.
@@ -37,7 +37,7 @@ class Diagnosis:
 
 
 def of_error(name: str, error: DeviceError, expected: str, verdict: Grade = Grade.FAILED) -> Diagnosis:
-    """The check that failed with an error of a device."""
+    """Result of a check that failed with a device error."""
     reply = f" It answered {error.reply!r}." if error.reply else ""
     observed = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
     return Diagnosis(name, verdict, observed, error.expected or expected, error.advice)

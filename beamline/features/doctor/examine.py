@@ -65,7 +65,7 @@ class ScanNeeds:
         return self.waiting_bytes + self.ring_bytes
 
     def backlog(self, rate: float) -> float:
-        """The largest number of bytes that wait for a disk of `rate` bytes/s."""
+        """Most bytes that ever wait for a disk that writes `rate` bytes/s."""
         most = waiting = 0.0
         for n_bytes, seconds in self.stretches:
             waiting = max(waiting + n_bytes - rate * seconds, 0.0)

@@ -19,7 +19,7 @@ from recon.prep.counts import Emission, weighted_lines
 def prepare_emission(
     source: ScanSource, emission_of: EmissionOf, selection: Selection, warn: Warn
 ) -> PreparedProjections:
-    """The views that `selection` asks for. Nothing is corrected: counts go in as they are, with what is known of them.
+    """Prepare the selected views of an emission: counts without corrections, with their survival and background.
 
     Raises:
         ConfigError: binning, columns or a correction, which are of views in transmission.

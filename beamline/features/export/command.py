@@ -16,7 +16,6 @@ from beamline.cli.options import (
     NameChoice,
     WholeRange,
     dataset_option,
-    json_events,
     json_option,
     parsed,
     refuse_contradictions,
@@ -26,15 +25,12 @@ from beamline.cli.options import (
     with_request,
 )
 from beamline.cli.recipe import Repeatable, names_given
-from beamline.cli.terminal import counting, events_shown
+from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing
-from beamline.core.sinks import Warnings
-from beamline.core.stop import terminated_like_interrupted
+from beamline.core.sinks import Warn
 from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
-from drivers.base.clock import SystemClock
 from recon.base.views import spread
 
 if TYPE_CHECKING:
@@ -57,21 +53,17 @@ def export_film(of: str, file: Path, output: Path, style: FilmStyle, dataset: tu
     """
     from beamline.features.export.film_file import write_film
 
-    clock = SystemClock()
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
-        with _images(of, file, style, dataset, sink) as images:
-            made = write_film(output, images, style, counting("images", sink, clock))
+        with _images(of, file, style, dataset, answer.warn) as images:
+            made = write_film(output, images, style, answer.counting("images"))
         every = images.shown[1] - images.shown[0] if of != VIEWS and len(images.shown) > 1 else 1
-        facts = {"output": output, "film": of, "images": made.images, "shape": made.shape, "fps": made.fps}
-        sink(Done({**facts, "window": made.window}, time=clock.now()))
-    if not as_json:
-        click.echo("\n".join(_lines(output, of, made, every)))
+        answer.done({"output": output, "film": of, **vars(made)}, *_lines(output, of, made, every))
 
 
 @contextmanager
 def _images(
-    of: str, file: Path, style: FilmStyle, dataset: tuple[str | None, int | None], sink: Sink
+    of: str, file: Path, style: FilmStyle, dataset: tuple[str | None, int | None], warn: Warn
 ) -> Iterator[FilmImages]:
     from beamline.features.export.film_file import slices_along
 
@@ -85,7 +77,7 @@ def _images(
     from beamline.storage.readers.open import SourceOptions
 
     with SourceOptions(file, frames_per_view=None).open() as source:
-        yield views_by_angle(source, style.side, Warnings(sink, SystemClock()))
+        yield views_by_angle(source, style.side, warn)
 
 
 def _lines(output: Path, of: str, made: WrittenFilm, every: int) -> list[str]:
@@ -225,9 +217,7 @@ def _export_voxels(request: ExportRequest) -> None:
         raise click.UsageError(
             f"{format_of(request.output).name} holds the values themselves: leave out --bits and --window."
         )
-    clock = SystemClock()
-    began = clock.now()
-    with terminated_like_interrupted(), json_events(request.as_json) as sink:
+    with answering(request.as_json) as answer:
         refuse_existing(request.output)
         with opened_volume(request.volume, request.dataset, request.at) as record:
             if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
@@ -239,23 +229,15 @@ def _export_voxels(request: ExportRequest) -> None:
                 raise ConfigError(f"--bits {request.bits} needs --window LOW:HIGH. {_suggestion(record)}")
             clipped = write_volume(request.output, record, pixels)
             shape = record.volume.grid.shape
-        seconds = clock.now() - began
-        share = clipped / math.prod(shape)
-        facts = {
-            "output": request.output,
-            "shape": shape,
-            "bits": pixels.bits,
-            "window": request.window,
-            "clipped": share,
-        }
-        sink(Done({**facts, "seconds": seconds}, time=clock.now()))
-    if request.as_json:
-        return
-    click.echo(f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})")
-    click.echo(f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}")
-    if request.window is not None:
-        low, high = request.window
-        click.echo(f"window   {low:g} to {high:g}; {share:.3%} of the voxels lie outside and are clipped")
+        share, window = clipped / math.prod(shape), request.window
+        facts = {"output": request.output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
+        outside = f"{share:.3%} of the voxels lie outside and are clipped"
+        answer.done(
+            {**facts, "seconds": answer.seconds},
+            f"output   {request.output} ({format_of(request.output).name}, {pixels.dtype.name})",
+            f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}",
+            *([] if window is None else [f"window   {window[0]:g} to {window[1]:g}; {outside}"]),
+        )
 
 
 def _export_film(request: ExportRequest) -> None:
@@ -268,27 +250,25 @@ def _export_film(request: ExportRequest) -> None:
 
 
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
-    from beamline.features.export.ply import write_ply
+    from beamline.features.export.film_file import write_ply
     from beamline.gaussians.model import read_model
 
-    with terminated_like_interrupted(), json_events(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
         model = read_model(volume)
         write_ply(output, model)
-        sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
-    if not as_json:
-        click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
+        facts = {"output": output, "gaussians": model.gaussians.n}
+        answer.done(facts, f"output     {output} (PLY)", f"gaussians  {model.gaussians.n}, {model.gaussians.kernel}")
 
 
 def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
     from beamline.storage.pose_table import write_poses
 
-    with terminated_like_interrupted(), json_events(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
         views, axis_col = write_poses(output, volume)
-        sink(Done({"output": output, "views": views, "axis_col": axis_col}, time=SystemClock().now()))
-    if not as_json:
-        click.echo(f"output  {output} (CSV)\nviews   {views}\naxis    give --axis {axis_col:.2f} with these --poses")
+        lines = f"output  {output} (CSV)", f"views   {views}", f"axis    give --axis {axis_col:.2f} with these --poses"
+        answer.done({"output": output, "views": views, "axis_col": axis_col}, *lines)
 
 
 def _suggestion(record: ReconRecord) -> str:

@@ -1,4 +1,4 @@
-"""Films: grey images, such as the views of a scan, in an animated GIF, or in an MP4 where there is ffmpeg."""
+"""Films: grey images in an animated GIF, or in an MP4 where there is ffmpeg; and the Gaussians as a PLY file."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from PIL import GifImagePlugin, Image
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import whole_file
 from beamline.core.sinks import Warn
+from beamline.gaussians.model import Model
 from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
@@ -67,7 +68,7 @@ class FilmStyle:
 
 @dataclass(frozen=True)
 class WrittenFilm:
-    """What a film that was written shows: so many images of (rows, cols), images a second, and the grey window."""
+    """A written film: number of images, their shape (rows, cols), images a second, and the grey window."""
 
     images: int
     shape: tuple[int, int]
@@ -76,7 +77,7 @@ class WrittenFilm:
 
 
 def thinned(n: int) -> range:
-    """Every k-th of n, so that they are MOST_IMAGES at most."""
+    """Every k-th of n images, at most MOST_IMAGES."""
     return range(0, n, math.ceil(n / MOST_IMAGES))
 
 
@@ -144,7 +145,7 @@ def write_film(path: Path, images: FilmImages, style: FilmStyle, progress: Calla
 
 
 def resized(image: F32, shape: tuple[int, int]) -> F32:
-    """An image with so many rows and columns: where there are fewer, each is the mean of what it covers."""
+    """The image averaged down to a shape (rows, cols)."""
     if image.shape == shape:
         return image
     whole = Image.fromarray(np.ascontiguousarray(image, np.float32))
@@ -236,7 +237,7 @@ _LOOKED_AT_VIEWS = 9  # views that tell the grey window
 
 
 def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
-    """The views of a scan by flats and darks, binned where that leaves `side` pixels or more; those unlit are left out.
+    """Corrected views of a scan by angle, binned where that leaves `side` pixels or more; unlit ones are left out.
 
     Raises:
         DataError: it has no view whose angle is known; while the images are read: none of these views can be used.
@@ -269,3 +270,26 @@ def views_by_angle(source: ScanSource, side: int, warn: Warn) -> FilmImages:
     height, width = source.row_pitch_mm, source.pixel_size_mm
     ratio = 1.0 if height is None or width is None else height / width
     return FilmImages(shown, lambda: images(shown), lambda: images(few), ratio)
+
+
+def write_ply(path: Path, model: Model) -> None:
+    """The Gaussians as a binary PLY: x y z, scale_0..2 (standard deviations), rot_0..3 (w x y z), density.
+
+    Raises:
+        DataError: `path` exists, or the disk refuses; nothing is left.
+    """
+    arrays, unit = model.gaussians.physical(), model.record.length_unit
+    names = ("x", "y", "z", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "density")
+    columns = (arrays["centres"], arrays["widths"], arrays["rotations"], arrays["densities"][:, None])
+    rows = np.concatenate(columns, axis=1).astype("<f4")
+    head = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment lengths in {unit}, densities in {model.record.unit}, kernel {model.gaussians.kernel}",
+        f"element vertex {len(rows)}",
+        *(f"property float {name}" for name in names),
+        "end_header",
+    ]
+    with whole_file(path) as partial, partial.open("wb") as file:
+        file.write(("\n".join(head) + "\n").encode())
+        file.write(rows.tobytes())

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import POSITIVE, as_scan, json_events, json_option, scan_argument
+from beamline.cli.options import POSITIVE, as_scan, json_option, scan_argument
 from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
 from beamline.cli.selection_options import light_asked, light_options, scan_options
-from beamline.cli.terminal import counting, events_shown
+from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
-from beamline.core.events import Done, RuleBroken
+from beamline.core.events import RuleBroken
 from beamline.core.files import refuse_existing
-from beamline.core.text import count, printable
+from beamline.core.text import aligned, count, printable
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -60,8 +60,7 @@ def info(
     takes regions that somebody has drawn, such as a TIFF of labels. "SSIM whole slices" has means and variances of
     whole slices, without windows; "SSIM 3D" is that of reports.
     """
-    from beamline.features.files.describe import describe
-    from beamline.storage.flag_legend import counted
+    from beamline.features.files.validate import describe
     from beamline.storage.readers.open import SourceOptions
 
     light = light_asked(photons_per_count, dose_in)
@@ -75,30 +74,32 @@ def info(
     if truth or masks:
         _print_measured(file, truth, masks, as_json)
         return
-    with json_events(as_json) as sink:
+    with answering(as_json) as answer:
         facts = dict(describe(SourceOptions(file, **scan_facts)))
         returned = _returned(SourceOptions(file, **scan_facts)) if "alignment" in facts.get("kinds", {}) else []
         if returned:
             facts["returned"] = [vars(view) for view in returned]
-        sink(Done(facts, time=SystemClock().now()))
-    if as_json:
-        return
-    attributes, findings = facts.pop("attributes"), facts.pop("findings")
-    facts.pop("returned", None)
-    attributes = {**attributes, **facts.pop("used", {}), **facts.pop("not_used", {})}
-    if facts.get("flags") is not None:
-        facts["flags"] = counted(facts["flags"])
-    width = max(len(name) for name in (*facts, *attributes)) + 2
-    for name, value in (facts | attributes).items():
-        click.echo(f"{name:<{width}}{_text(value)}")
-    for view in returned:
-        click.echo(f"{'on the way back':<{width}}{view.in_words()}")
-    for message in findings:
-        click.echo(f"! {message}")
+        answer.done(facts, *_described(facts, [view.in_words() for view in returned]))
+
+
+def _described(facts: Mapping[str, Any], returned: Sequence[str]) -> list[str]:
+    """The facts of a scan or a volume in lines, with how the sample came back to earlier angles."""
+    from beamline.storage.flag_legend import counted
+
+    apart = ("attributes", "used", "not_used", "findings", "returned")
+    shown = {name: value for name, value in facts.items() if name not in apart}
+    if shown.get("flags") is not None:
+        shown["flags"] = counted(shown["flags"])
+    for name in apart[:3]:
+        shown |= facts.get(name, {})
+    width = max(map(len, shown)) + 2
+    lines = [f"{name:<{width}}{_text(value)}" for name, value in shown.items()]
+    lines += [f"{'on the way back':<{width}}{words}" for words in returned]
+    return [*lines, *(f"! {message}" for message in facts["findings"])]
 
 
 def _returned(scan: SourceOptions) -> list[ReturnedView]:
-    from beamline.features.files.describe import LOOK
+    from beamline.features.files.validate import LOOK
     from beamline.projections.flagged_frames import returned_views
     from beamline.storage.readers.base import LookedEnoughError
     from beamline.storage.readers.open import open_scan
@@ -115,41 +116,30 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
     from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
 
-    clock = SystemClock()
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         if output is not None:
             refuse_existing(output)
         with open_scan(scan) as source:
             if light is not None:
                 light.refuse_impossible(source)
-            statistics = statistics_of(source, counting("statistics", sink, clock))
+            statistics = statistics_of(source, answer.counting("statistics"))
             dose = [] if light is None else light_of(source, statistics, light).in_words()
         rows = table(statistics)
         if output is not None:
             write_whole(output, histograms(statistics))
         facts = {kind: dict(zip(rows[0][1:], figures, strict=True)) for kind, *figures in rows[1:]}
-        sink(Done({**facts, "light": dose, "output": output}, time=clock.now()))
-    if as_json:
-        return
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        click.echo("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)))
-    for line in dose:
-        click.echo(f"light   {line}")
-    if output is not None:
-        click.echo(f"output  {output}")
+        lines = [aligned(rows, ">"), *(f"light   {line}" for line in dose)]
+        lines += [] if output is None else [f"output  {output}"]
+        answer.done({**facts, "light": dose, "output": output}, *lines)
 
 
 def _print_measured(file: Path, truth: str | None, masks: Path | None, as_json: bool) -> None:
     from beamline.reconstruct.measure import measured_file
     from beamline.report.metrics import METRICS, formatted
 
-    with json_events(as_json) as sink:
+    with answering(as_json) as answer:
         values = measured_file(file, truth, masks)
-        sink(Done(values, time=SystemClock().now()))
-    if not as_json:
-        for name, value in values.items():
-            click.echo(f"{METRICS[name].label:<20}{formatted(name, value)}")
+        answer.done(values, *(f"{METRICS[name].label:<20}{formatted(name, value)}" for name, value in values.items()))
 
 
 def _text(value: Any) -> str:
@@ -180,19 +170,15 @@ def validate(file: Path, deep: bool, as_json: bool, **scan_facts: Any) -> None:
     from beamline.features.files.validate import validate as findings_of
     from beamline.storage.readers.open import SourceOptions
 
-    clock = SystemClock()
-    with events_shown(as_json) as sink:
-        progress = counting("validate", sink, clock)
-        findings, now = findings_of(SourceOptions(file, **scan_facts), progress if deep else None), clock.now()
+    with answering(as_json) as answer:
+        progress = answer.counting("validate") if deep else None
+        findings, now = findings_of(SourceOptions(file, **scan_facts), progress), answer.clock.now()
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for finding in findings:
-            sink(RuleBroken(**vars(finding), time=now))
-        sink(Done({"file": file, **counts}, time=now))
-    errors = count(counts["error"], "error")
-    if not as_json:
-        for finding in findings:
-            click.echo(f"{finding.severity:<9}{finding.rule:<16}{finding.message}")
-        click.echo(f"{file}: {errors}, {count(counts['warning'], 'warning')}")
+            answer.sink(RuleBroken(**vars(finding), time=now))
+        errors = count(counts["error"], "error")
+        lines = [f"{finding.severity:<9}{finding.rule:<16}{finding.message}" for finding in findings]
+        answer.done({"file": file, **counts}, *lines, f"{file}: {errors}, {count(counts['warning'], 'warning')}")
     if counts["error"]:
         raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
 
@@ -232,9 +218,7 @@ def ingest(
     from beamline.features.files.ingest import ingest as ingest_scan
     from beamline.storage.readers.open import SourceOptions
 
-    clock = SystemClock()
-    began = clock.now()
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
         done = ingest_scan(
             SourceOptions(source, **scan_facts),
@@ -243,14 +227,13 @@ def ingest(
             energy_kev=energy_kev,
             sample=sample,
             no_data=no_data,
-            progress=counting("ingest", sink, clock),
+            progress=answer.counting("ingest"),
         )
-        seconds = clock.now() - began
-        sink(Done({**vars(done), "output": done.path, "seconds": seconds}, time=clock.now()))
-    if as_json:
-        return
-    click.echo(f"output   {done.path} ({done.definition})")
-    click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
-    for doubt in done.doubts:
-        click.echo(f"! {doubt}")
-    click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")
+        seconds = answer.seconds
+        answer.done(
+            {**vars(done), "output": done.path, "seconds": seconds},
+            f"output   {done.path} ({done.definition})",
+            f"frames   {done.frames}, {done.invalid_frames} without a valid pixel",
+            *(f"! {doubt}" for doubt in done.doubts),
+            f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s",
+        )

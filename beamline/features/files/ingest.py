@@ -34,7 +34,7 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class Ingested:
-    """What was written: `definition` says whether it is an NXtomo; `invalid_frames`: frames without a valid pixel.
+    """The written copy. `definition`: NXtomo, or float projections; `invalid_frames`: frames without a valid pixel.
 
     `doubts`: what the input states that may change the volume, that is not used, and that the copy does not state.
     """

@@ -19,12 +19,12 @@ Rule = Callable[[Places], Iterator[Finding]]
 
 
 def nexus_findings(file: h5py.File) -> list[Finding]:
-    """What the rules find in every tomography entry of a file; [] for a file that has none."""
+    """Findings in every tomography entry of a file; [] for a file without one."""
     return [finding for places in find(file) for rule in RULES for finding in _found(rule, places)]
 
 
 def _found(rule: Rule, places: Places) -> list[Finding]:
-    """What a rule finds; one that cannot even be asked is an error: the file is damaged, or altered."""
+    """Findings of one rule; a rule that fails to read the file is an error, too: it is damaged, or altered."""
     try:
         return list(rule(places))
     except hdf5.ALTERED as error:
@@ -32,30 +32,25 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
 
 
 def definition_stated(places: Places) -> Iterator[Finding]:
-    """The entry says that it is an NXtomo."""
+    """The entry says that it is an NXtomo, whose data are what the detector counted (NX_INT)."""
     definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
     if definition == layout.FLOAT_DEFINITION:
         yield Finding("info", "definition", f"{definition}: float frames in NXtomo's places, on purpose not an NXtomo.")
     elif definition != layout.NXTOMO:
         yield Finding("warning", "definition", f"{places.entry.name}/definition is {definition!r}, expected 'NXtomo'.")
-
-
-def integer_frames(places: Places) -> Iterator[Finding]:
-    """NXtomo's data are what the detector counted (NX_INT)."""
     if places.data.dtype.kind not in "iu" and hdf5.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION:
-        yield Finding(
-            "error",
-            "integer-frames",
-            f"Frames are {places.data.dtype}; NXtomo demands integers, as the camera counted.",
-        )
+        message = f"Frames are {places.data.dtype}; NXtomo demands integers, as the camera counted."
+        yield Finding("error", "integer-frames", message)
 
 
-def key_length(places: Places) -> Iterator[Finding]:
-    """One image key a frame."""
+def lengths(places: Places) -> Iterator[Finding]:
+    """One image key and one angle a frame."""
     for name in ("image_key", "image_key_control"):
         key = hdf5.dataset(places.detector, name)
         if key is not None and key.size != places.data.shape[0]:
             yield Finding("error", "key-length", f"{name} has {key.size} entries for {places.data.shape[0]} frames.")
+    if places.angle is not None and places.angle.size != places.data.shape[0]:
+        yield Finding("error", "angle-length", f"{places.angle.size} angles for {places.data.shape[0]} frames.")
 
 
 def key_codes(places: Places) -> Iterator[Finding]:
@@ -65,12 +60,6 @@ def key_codes(places: Places) -> Iterator[Finding]:
         wrong = set() if key is None else set(np.unique(hdf5.values_of(key)).tolist()) - legal
         if wrong:
             yield Finding("error", "key-codes", f"{name} holds {sorted(wrong)}; legal are {sorted(legal)}.")
-
-
-def angle_length(places: Places) -> Iterator[Finding]:
-    """One angle a frame."""
-    if places.angle is not None and places.angle.size != places.data.shape[0]:
-        yield Finding("error", "angle-length", f"{places.angle.size} angles for {places.data.shape[0]} frames.")
 
 
 def angle_units(places: Places) -> Iterator[Finding]:
@@ -219,10 +208,8 @@ def frames_counted(places: Places) -> Iterator[Finding]:
 
 RULES: tuple[Rule, ...] = (
     definition_stated,
-    integer_frames,
-    key_length,
+    lengths,
     key_codes,
-    angle_length,
     angle_units,
     links_targeted,
     axis_order,

@@ -24,11 +24,9 @@ from beamline.cli.options import (
     volume_argument,
     volume_path,
 )
-from beamline.cli.terminal import counting, events_shown
+from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, whole_file
-from drivers.base.clock import Clock, SystemClock
 from recon.base.registry import unknown
 
 if TYPE_CHECKING:
@@ -68,14 +66,14 @@ def angles_of(text: str) -> NDArray[np.float64]:
 
 
 @contextmanager
-def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Sink, Clock]]:
+def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Answer]]:
     """The model behind `volume`, for a new file at `output`."""
     from beamline.gaussians.model import read_model  # here: help needs none of it
 
     refuse_shared({"VOLUME": volume, "--output": output})
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
-        yield read_model(volume), sink, SystemClock()
+        yield read_model(volume), answer
 
 
 @click.command()
@@ -99,16 +97,15 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
     from beamline.features.models.made import box_grid, voxelised
     from beamline.storage.volumes.files import write_volume
 
-    with _making(volume, output, as_json) as (model, sink, clock):
+    with _making(volume, output, as_json) as (model, answer):
         try:
             grid = box_grid(model.record.volume.grid, voxel, box)
         except ValueError as error:
             raise click.UsageError(f"{error}. Nothing was written.") from error
-        made = voxelised(model, grid, counting("slices", sink, clock))
-        write_volume(output, replace(model.record, volume=made, time=clock.now()))
-        sink(Done({"output": output, "shape": grid.shape, "voxel": grid.voxel_size}, time=clock.now()))
-    if not as_json:
-        click.echo(f"output  {output}, {' x '.join(map(str, grid.shape))} voxels")
+        made = voxelised(model, grid, answer.counting("slices"))
+        write_volume(output, replace(model.record, volume=made, time=answer.clock.now()))
+        facts = {"output": output, "shape": grid.shape, "voxel": grid.voxel_size}
+        answer.done(facts, f"output  {output}, {' x '.join(map(str, grid.shape))} voxels")
 
 
 @click.command()
@@ -130,12 +127,10 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
 
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise click.UsageError(f"-o {output}: views are HDF5; give a name such as {output.with_suffix('.h5')}.")
-    with _making(volume, output, as_json) as (model, sink, clock):
+    with _making(volume, output, as_json) as (model, answer):
         views = model.geometry.angles if angles is None else angles
-        write_views(output, model, views, counting("views", sink, clock))
-        sink(Done({"output": output, "n_views": views.size}, time=clock.now()))
-    if not as_json:
-        click.echo(f"output  {output}, {views.size} views")
+        write_views(output, model, views, answer.counting("views"))
+        answer.done({"output": output, "n_views": views.size}, f"output  {output}, {views.size} views")
 
 
 _TOGETHER = 2**16  # triangles or vertices
@@ -214,10 +209,9 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
     from beamline.features.models.made import surface_of_gaussians, surface_of_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})
-    with events_shown(as_json) as sink:
+    with answering(as_json) as answer:
         refuse_existing(output)
-        clock = SystemClock()
-        count = counting("slices", sink, clock)
+        count = answer.counting("slices")
         try:
             if source == "volume":
                 extracted = surface_of_volume(volume, dataset, level, count)
@@ -230,9 +224,10 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
         write_mesh(output, extracted.mesh, extracted.unit)
         mesh, unit = extracted.mesh, extracted.unit
         facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "euler": mesh.euler}
-        sink(Done({"output": output, "level": extracted.level, **facts, "volume": mesh.volume, "unit": unit},
-                  time=clock.now()))  # fmt: skip
-    if not as_json:
-        click.echo(f"output   {output}\nlevel    {extracted.level:.5g} {extracted.level_unit}".rstrip())
-        click.echo(f"mesh     {facts['vertices']} vertices, {facts['triangles']} triangles, Euler number {mesh.euler}")
-        click.echo(f"matter   {mesh.volume:.6g} {unit}³ inside")
+        answer.done(
+            {"output": output, "level": extracted.level, **facts, "volume": mesh.volume, "unit": unit},
+            f"output   {output}",
+            f"level    {extracted.level:.5g} {extracted.level_unit}".rstrip(),
+            f"mesh     {facts['vertices']} vertices, {facts['triangles']} triangles, Euler number {mesh.euler}",
+            f"matter   {mesh.volume:.6g} {unit}³ inside",
+        )

@@ -46,7 +46,7 @@ def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ..
 
 
 def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Volume:
-    """The model on a grid, sixteen slices at a time; `count` takes slices done and all."""
+    """Voxelise the model on a grid, sixteen slices at a time; `count` gets (slices done, all slices)."""
     data = np.empty(grid.shape, np.float32)
     for first in range(0, grid.shape[0], _SLICES):
         part = slice(first, min(first + _SLICES, grid.shape[0]))

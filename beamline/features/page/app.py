@@ -79,16 +79,12 @@ class Strangers:
 
     def end(self, client: object) -> None:
         """Close a connection, if it is still one of these."""
-        self._ends.pop(client, _nothing)()
-
-
-def _nothing() -> None:
-    """There is nothing to close."""
+        self._ends.pop(client, lambda: None)()
 
 
 @dataclass(frozen=True)
 class Access:
-    """Who may do what."""
+    """Host names and tokens of a page: who may look, and who may act."""
 
     hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
@@ -188,7 +184,7 @@ def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Mi
 
 
 def _refused(request: Request, error: Exception) -> Response:
-    """What no file gives, as a sentence."""
+    """A user error as a sentence, with status 404."""
     return JSONResponse({"message": user_message(error)}, 404)
 
 

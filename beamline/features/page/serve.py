@@ -78,7 +78,7 @@ def _connections(strangers: Strangers) -> type[asyncio.Protocol]:
 
 
 class PageServer:
-    """A server that is ready to run, with known addresses."""
+    """A server bound to its port; `run` serves."""
 
     def __init__(self, app: Starlette, listening: socket.socket, access: Access) -> None:
         self._listening = listening

@@ -16,15 +16,12 @@ from beamline.cli.options import (
     FiniteRange,
     NameChoice,
     WholeRange,
-    json_events,
     json_option,
     volume_argument,
 )
 from beamline.cli.recipe import Repeatable, repeating
+from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError
-from beamline.core.events import Done
-from beamline.core.stop import terminated_like_interrupted
-from drivers.base.clock import SystemClock
 from recon.base.choices import NECK
 
 if TYPE_CHECKING:
@@ -107,12 +104,10 @@ def segment(
         command=repeating(click.get_current_context(), volume, output),
         **values,
     )
-    with terminated_like_interrupted(), json_events(as_json) as sink:
+    with answering(as_json) as answer:
         labels = segment_volume(options)
         files = {"output": output, "table": options.table, "picture": options.picture}
-        sink(Done({**files, **settings_of(labels, options)}, time=SystemClock().now()))
-    if not as_json:
-        click.echo(summary(labels, options))
+        answer.done({**files, **settings_of(labels, options)}, summary(labels, options))
     if view:
         show(labels)
 

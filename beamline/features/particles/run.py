@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
 from beamline.core.shipped import version
-from beamline.core.text import count
+from beamline.core.text import count, csv_text
 from beamline.report.figures import WIDTH, downwards, new_figure, png, show_grey, slice_extent
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
@@ -243,18 +241,17 @@ def _is_scan(path: Path) -> bool:
 
 def table_of(found: Segmented) -> str:
     """One line a particle, largest first."""
-    unit, particles, out = found.unit, found.particles, io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    unit, particles = found.unit, found.particles
     heading = [f"volume_{unit}3", f"equivalent_diameter_{unit}", f"z_{unit}", f"y_{unit}", f"x_{unit}", "cut"]
     bars = found.volume_deviation
     interval = [] if bars is None else [f"volume_low_{unit}3", f"volume_high_{unit}3"]
-    writer.writerow(["label", *heading, *interval])
+    rows = [["label", *heading, *interval]]
     for i in np.argsort(-particles.volume, kind="stable").tolist():
         sizes = (particles.volume[i], particles.diameter[i], *particles.centroid[i])
         ends = () if bars is None else (max(particles.volume[i] - bars[i], 0.0), particles.volume[i] + bars[i])
         row = [particles.label[i], *(f"{value:.6g}" for value in sizes), int(particles.cut[i])]
-        writer.writerow([*row, *(f"{value:.6g}" for value in ends)])
-    return out.getvalue()
+        rows.append([*row, *(f"{value:.6g}" for value in ends)])
+    return csv_text(rows)
 
 
 def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:

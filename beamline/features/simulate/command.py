@@ -43,7 +43,7 @@ def simulate(request: SimulateRequest) -> None:
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
-    from beamline.features.simulate.write import check_output, exposure_errors, scan_of
+    from beamline.features.simulate.write import check_output, exposure_errors, scan_of, sheet
     from beamline.scenes.scene_file import feature_of, open_scene
 
     clock = SystemClock()
@@ -73,8 +73,6 @@ def simulate(request: SimulateRequest) -> None:
                 outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
             if picture and not (written and written.stopped):
                 marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
-                from beamline.features.simulate.figure import sheet  # matplotlib takes a second
-
                 write_whole(picture, sheet(scan, marked))
                 outputs |= {"picture": picture}
                 output("picture", str(picture))

@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from beamline.cli.options import (
     Declared,
     dry_option,
-    json_events,
     json_option,
     name_of,
     option,
 )
 from beamline.cli.recipe import names_given
 from beamline.cli.recon import options_of, recon
-from beamline.cli.terminal import counting, events_shown
+from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
-from beamline.core.events import Done
 from beamline.core.files import refuse_existing, write_whole
-from beamline.core.sinks import Warnings
+from beamline.core.text import aligned, csv_text
 from beamline.features.sweeps.values import SweptOption, combinations, swept_option
 from beamline.report.metrics import METRICS
-from drivers.base.clock import SystemClock
 from recon.methods import BASELINE
 
 if TYPE_CHECKING:
@@ -88,12 +83,10 @@ def sweep(words: tuple[str, ...], output: Path | None, dry: bool, as_json: bool)
         _print_needs(trials, path, as_json)
         return
     slices, scores = _run(trials, options, path, as_json)
-    if not as_json:
-        click.echo(f"{_lines(slices, scores)}\nsheet     {path}\ntable     {table}")
-        if scores is not None and scores.best is not None:
-            best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
-            again = shlex.join(["beamline", "recon", *common, *best])
-            click.echo(f"If the pictures agree: {again}", err=True)
+    if not as_json and scores is not None and scores.best is not None:
+        best = [word for item in slices[scores.best].values.items() for word in _as_words(*item)]
+        again = shlex.join(["beamline", "recon", *common, *best])
+        click.echo(f"If the pictures agree: {again}", err=True)
     if len(slices) < len(trials):
         raise ScanStopped(f"The sweep was stopped after {len(slices)} of {len(trials)} slices; {path} holds them.")
 
@@ -161,18 +154,16 @@ def _run(
     trials: Trials, options: Sequence[SweptOption], path: Path, as_json: bool
 ) -> tuple[list[SweptSlice], Scores | None]:
     """Write the sheet and the table of the slices, as far as they were made."""
-    from beamline.features.sweeps.sheet import sweep_sheet
-    from beamline.features.sweeps.sweep import scores_of, sliced, sweep_slices
+    from beamline.features.sweeps.sweep import scores_of, sliced, sweep_sheet, sweep_slices
 
     slices: list[SweptSlice] = []
     first = trials[0][1]
-    with events_shown(as_json) as sink:
-        clock = SystemClock()
-        warn = Warnings(sink, clock)
+    with answering(as_json) as answer:
+        sink, clock = answer.sink, answer.clock
         with sliced([each for _, each in trials]) as cut:
             planned = [(values, each) for (values, _), each in zip(trials, cut, strict=True)]
             try:
-                for each in sweep_slices(planned, sink, clock, counting("slices", sink, clock)):
+                for each in sweep_slices(planned, sink, clock, answer.counting("slices")):
                     slices.append(each)
             except KeyboardInterrupt:
                 if not slices:
@@ -180,15 +171,15 @@ def _run(
             rows = cut[0].selection.rows
         scores = scores_of(slices, direct=first.method.traits.direct)
         for sentence in _remarks(slices, scores, options, direct=first.method.traits.direct):
-            warn(sentence)
+            answer.warn(sentence)
         where = "" if rows is None else f", row {(rows[0] + rows[1]) // 2}"
         title = f"{Path(first.source.path).name}{where}, {slices[0].views.prepared.geometry.n_views} views"
         write_whole(path.with_suffix(".csv"), table_of(slices, scores))
         write_whole(path, sweep_sheet(slices, scores, options, title))
         best = None if scores is None or scores.best is None else dict(slices[scores.best].values)
         means = None if scores is None else scores.shares.tolist()
-        sink(Done({"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means},
-                  time=clock.now()))  # fmt: skip
+        facts = {"output": str(path), "table": str(path.with_suffix(".csv")), "best": best, "scores": means}
+        answer.done(facts, _lines(slices, scores), f"sheet     {path}", f"table     {facts['table']}")
     return slices, scores
 
 
@@ -224,13 +215,11 @@ def _remarks(
 
 def table_of(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
     """CSV: values, the residual of views held out, whether the slice is the best one or alike, and seconds."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*slices[0].values, "residual_held_out", "verdict", "seconds"])
+    rows = [[*slices[0].values, "residual_held_out", "verdict", "seconds"]]
     for n, each in enumerate(slices):
         residual = "" if scores is None else f"{scores.shares[n]:.6g}"
-        writer.writerow([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
-    return out.getvalue()
+        rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.3g}"])
+    return csv_text(rows)
 
 
 def _verdict(scores: Scores | None, n: int) -> str:
@@ -240,14 +229,11 @@ def _verdict(scores: Scores | None, n: int) -> str:
 
 
 def _lines(slices: Sequence[SweptSlice], scores: Scores | None) -> str:
-    names = list(slices[0].values)
-    head = [*names, METRICS["residual_held_out"].label, "", "s"]
-    rows = [head]
+    rows = [[*slices[0].values, METRICS["residual_held_out"].label, "", "s"]]
     for n, each in enumerate(slices):
         residual = "-" if scores is None else f"{scores.shares[n]:.5g}"
         rows.append([*each.values.values(), residual, _verdict(scores, n), f"{each.seconds:.2g}"])
-    widths = [max(len(row[at]) for row in rows) for at in range(len(head))]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return aligned(rows, ">")
 
 
 def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
@@ -259,19 +245,18 @@ def _print_needs(trials: Trials, path: Path, as_json: bool) -> None:
     from beamline.reconstruct.estimate import estimate
     from recon.assess.time_model import duration_text
 
-    with json_events(as_json) as sink:
+    with answering(as_json) as answer:
         speed = MachineSpeed()
         with sliced([each for _, each in trials]) as cut:
             needs = [estimate(each, speed, busy()) for each in cut]
         together = Need.in_turn(needs)
         total = None if any(each.seconds is None for each in needs) else together.seconds
-        facts: dict[str, Any] = {"slices": len(needs), "memory": together.memory, "seconds": total}
-        sink(Done({**facts, "output": str(path)}, time=SystemClock().now()))
-    if not as_json:
-        time = "not known" if total is None else f"about {duration_text(total)} at most"
-        one = needs[0]
-        click.echo(
-            f"slices    {len(needs)}, each of {count(one.shape[0], 'row')} by {one.method}, from {one.views} views\n"
-            f"memory    {size(facts['memory'])}\ntime      {time}, reading and correction not counted\n"
-            f"sheet     {path}"
+        time, first = "not known" if total is None else f"about {duration_text(total)} at most", needs[0]
+        rows = count(first.shape[0], "row")
+        answer.done(
+            {"slices": len(needs), "memory": together.memory, "seconds": total, "output": str(path)},
+            f"slices    {len(needs)}, each of {rows} by {first.method}, from {first.views} views",
+            f"memory    {size(together.memory or 0)}",
+            f"time      {time}, reading and correction not counted",
+            f"sheet     {path}",
         )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +15,29 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
 from beamline.core.sinks import Warnings
+from beamline.features.sweeps.values import SweptOption
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.report.figures import WIDTH, new_figure, png, show_grey
+from beamline.report.metrics import METRICS
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.arrays import F32, F64
 from recon.base.empirical import ONE_IN
+from recon.base.greys import matter_window
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
 from recon.voxels.held_out import beyond_chance
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 _FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
 _TALLEST = 16  # rows of a slab around the slice, as of trials of a method
@@ -94,7 +103,7 @@ class Scores:
 
     @property
     def alike(self) -> list[bool]:
-        """Which slices are told from the best one by no more than chance; also the best one itself."""
+        """Which slices differ from the best by no more than chance; the best is one of them."""
         if self.best is None:
             return [False] * len(self.residuals)
         best = self.residuals[self.best]
@@ -213,7 +222,7 @@ def _held_out(prepared: PreparedProjections) -> HeldOutViews:
 
 
 def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores | None:
-    """How well each volume predicts the views that none has learnt from; None where their pixels, or views, differ.
+    """Residual of each volume in the views held out; None where slices differ in pixels, or in all views held out.
 
     A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
     compared with them as every value corrects them, and the mean counts.
@@ -241,3 +250,77 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
     if scale == 0:
         raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
     return Scores(residuals / scale, alike, direct)
+
+
+_COLUMNS, _CURVE = 4, 2.2  # pictures in a row; inches
+_CROP = 200  # pixels a side: of larger slices the part is shown that changes most, in proportion to its values
+
+
+def sweep_sheet(
+    slices: Sequence[SweptSlice], scores: Scores | None, options: Sequence[SweptOption], title: str
+) -> bytes:
+    """The slices as PNG, y downwards. The best is framed in red, and those that chance does not tell from it in orange.
+
+    Two options make a grid, the values of the second one side by side.
+    """
+    across = len(options[1].values) if len(options) > 1 else min(_COLUMNS, len(slices))
+    down = -(-len(slices) // across)
+    part = _changes_most([each.image for each in slices])
+    images = [each.image[part] for each in slices]
+    window = matter_window(*images)
+    tall, wide = images[0].shape
+    height = WIDTH / across * tall / wide + 0.42
+    curve = _CURVE if scores is not None and len(options) == 1 else 0.0
+    figure = new_figure((WIDTH, curve + height * down + 0.3))
+    figure.suptitle(title, fontsize=9)
+    panels = figure.add_gridspec(1 + down, across, height_ratios=[max(curve, 0.01), *[height] * down])
+    if scores is not None and curve:
+        _draw_curve(figure.add_subplot(panels[0, :]), slices, scores, options[0])
+    for n, (each, image) in enumerate(zip(slices, images, strict=True)):
+        axes = figure.add_subplot(panels[1 + n // across, n % across])
+        show_grey(axes, image, window)
+        axes.set(xticks=[], yticks=[])
+        if n == 0:
+            axes.set(xlabel="x →", ylabel="← y")
+        colour = _colour(scores, n)
+        words = each.label if scores is None else f"{each.label}\n{scores.shares[n]:.5g}"
+        axes.set_title(words, fontsize=7, color=colour)
+        for side in axes.spines.values():
+            side.set(color=colour, linewidth=0.8 if colour == "black" else 2.5)
+    return png(figure)
+
+
+def _colour(scores: Scores | None, n: int) -> str:
+    if scores is None or not scores.alike[n]:
+        return "black"
+    return "tab:red" if n == scores.best else "tab:orange"
+
+
+def _draw_curve(axes: Axes, slices: Sequence[SweptSlice], scores: Scores, option: SweptOption) -> None:
+    numbers = option.numbers[: len(slices)]
+    at = numbers or range(len(slices))
+    spread = min(numbers) > 0 and max(numbers) / min(numbers) > 30 if numbers else False
+    axes.plot(at, scores.shares, "o-", ms=3, lw=1, color="tab:blue")
+    for n, place in enumerate(at):
+        if scores.alike[n]:
+            axes.plot([place], [scores.shares[n]], "o", color=_colour(scores, n), ms=7)
+    if numbers and spread:
+        axes.set_xscale("log")
+    if not numbers:
+        axes.set_xticks(range(len(slices)), option.values[: len(slices)])
+    axes.set_xlabel(option.name, fontsize=8)
+    axes.set_ylabel(METRICS["residual_held_out"].label, fontsize=8)
+    axes.tick_params(labelsize=7)
+
+
+def _changes_most(images: Sequence[NDArray[np.float32]]) -> tuple[slice, slice]:
+    """The square of the slices in which the options change most; all of them where they are small or differ in size."""
+    shape = images[0].shape
+    if max(shape) <= _CROP or any(image.shape != shape for image in images):
+        return slice(None), slice(None)
+    spread = np.ptp(np.stack(images), axis=0)
+    total = np.pad(spread.cumsum(axis=0, dtype=np.float64).cumsum(axis=1), ((1, 0), (1, 0)))
+    rows, cols = (min(_CROP, n) for n in shape)
+    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
+    y, x = np.unravel_index(int(np.argmax(sums)), sums.shape)
+    return slice(int(y), int(y) + rows), slice(int(x), int(x) + cols)

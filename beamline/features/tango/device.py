@@ -29,19 +29,16 @@ SHOWN = [each for each in fields(RunValues) if each.name not in ("data_rate", "r
 """The values of a run that are attributes of the device, by the names of the process variables (docs/page.md)."""
 _RAISED = {"warnings": "ATTR_WARNING", "alarms": "ATTR_ALARM"}
 
+_STATES: dict[str, str] = {
+    **dict.fromkeys((State.FAILED, State.ABORTED, DIED), "FAULT"), State.PAUSED: "STANDBY", State.PREPARING: "INIT",
+    **dict.fromkeys((State.IDLE, State.DONE, State.STOPPED), "ON"),
+}  # fmt: skip
+
 
 def device_state(values: RunValues) -> str:
     """The name of Tango's state: RUNNING, ALARM where the monitor has alarms, STANDBY while the scan is paused, ON when
     none runs, FAULT after one that ended badly."""
-    if values.state in (State.FAILED, State.ABORTED, DIED):
-        return "FAULT"
-    if values.state == State.PAUSED:
-        return "STANDBY"
-    if values.state == State.PREPARING:
-        return "INIT"
-    if values.state in (State.IDLE, State.DONE, State.STOPPED):
-        return "ON"
-    return "ALARM" if values.alarms else "RUNNING"
+    return _STATES.get(values.state, "ALARM" if values.alarms else "RUNNING")
 
 
 def quality(stamped: StampedValues, name: str) -> str:

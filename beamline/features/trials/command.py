@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
@@ -32,13 +32,20 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, repeating
 from beamline.cli.selection_options import chosen, light_asked, light_options, selection_options
-from beamline.cli.terminal import events_shown
+from beamline.cli.terminal import answering, events_shown
 from beamline.core.errors import ScanStopped
-from beamline.core.files import REPORT
 from beamline.features.trials.view_choices import STUDIES
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
+
+if TYPE_CHECKING:
+    from beamline.core.events import Sink
+    from beamline.core.sinks import Warn
+    from beamline.features.trials.launch import TrialData
+    from beamline.features.trials.layout import TableLayout
+    from beamline.features.trials.runner import Planned
+    from beamline.features.trials.table import TrialTable
 
 
 def listed(value: str) -> tuple[str, ...]:
@@ -145,7 +152,6 @@ def tradeoff(request: TradeoffRequest) -> None:
     from beamline.core.sinks import Warnings
     from beamline.energies.scans import EnergyScans, read_spectra
     from beamline.features.trials.front import TRADEOFF
-    from beamline.features.trials.layout import text
     from beamline.features.trials.runner import ComparedScan
     from beamline.features.trials.tradeoff import SeveralVolumes, TradeoffOptions, planned_tradeoff, run_tradeoff
     from beamline.scan.energies import scans_of
@@ -173,19 +179,30 @@ def tradeoff(request: TradeoffRequest) -> None:
             seed=request.seed,
             command=repeating(context, files, folder),
         )
-        if not request.dry:
-            table = run_tradeoff(options, sink, SystemClock(), begun=begun)
-    if request.dry:
-        from beamline.features.trials.dry_run import print_dry_run  # here: help needs none of it
+    run = partial(run_tradeoff, options, begun=begun)
+    _compare(request, folder, TRADEOFF, partial(planned_tradeoff, options), run)
 
-        print_dry_run(partial(planned_tradeoff, options), folder, request.as_json)
+
+def _compare(
+    request: TradeoffRequest | StudyRequest,
+    folder: Path,
+    layout: TableLayout,
+    plan: Callable[[Warn], tuple[TrialData, Planned]],
+    run: Callable[[Sink, Clock], TrialTable],
+) -> None:
+    """Run a comparison and print its table, or print what it will take."""
+    from beamline.features.trials.dry_run import print_dry_run
+    from beamline.features.trials.layout import text
+
+    if request.dry:
+        print_dry_run(plan, folder, request.as_json)
         return
-    if not request.as_json:
-        click.echo(text(table, TRADEOFF))
-        click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
+    with answering(request.as_json) as answer:
+        table = run(answer.sink, answer.clock)
+        answer.lines = text(table, layout), f"\n{'report':<10}{folder / layout.page}"
     if table.stopped:
-        counts = f"{table.n_done} of {len(table.outcomes)}"
-        raise ScanStopped(f"The trade-off was stopped after {counts} trials; {folder} holds them.")
+        counts = f"{table.n_done} of {len(table.todo)} {layout.unit}"
+        raise ScanStopped(f"The {layout.name} was stopped after {counts}; {folder} holds those.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +267,6 @@ def study(request: StudyRequest) -> None:
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.features.trials.layout import text
     from beamline.features.trials.runner import ComparedScan
     from beamline.features.trials.study import StudyOptions, layout_of, planned_study, run_study
 
@@ -272,16 +288,4 @@ def study(request: StudyRequest) -> None:
         seed=request.seed,
         command=repeating(context, request.file, folder),
     )
-    if request.dry:
-        from beamline.features.trials.dry_run import print_dry_run  # here: help needs none of it
-
-        print_dry_run(partial(planned_study, options), folder, request.as_json)
-        return
-    with events_shown(request.as_json) as sink:
-        table = run_study(options, sink, SystemClock())
-    if not request.as_json:
-        click.echo(text(table, layout_of(STUDIES[request.which])))
-        click.echo(f"\n{'report':<10}{folder / REPORT}")
-    if table.stopped:
-        counts = f"{table.n_done} of {len(table.todo)}"
-        raise ScanStopped(f"The study was stopped after {counts} rows; {folder} holds those.")
+    _compare(request, folder, layout_of(options.study), partial(planned_study, options), partial(run_study, options))

@@ -9,20 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import click
 import psutil
 
-from beamline.cli.terminal import events_shown
-from beamline.core.events import Done
+from beamline.cli.terminal import answering
 from beamline.core.machine import Need, free_memory
 from beamline.core.machine_speed import MachineSpeed
-from beamline.core.sinks import Warn, Warnings
+from beamline.core.sinks import Warn
 from beamline.core.text import count, size
 from beamline.features.trials.launch import TrialData
 from beamline.features.trials.plans import expected_seconds
 from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import Trial
-from drivers.base.clock import SystemClock
 from recon.assess.time_model import duration_text
 from recon.base.volume import Grid
 from recon.base.work import Rates
@@ -114,12 +111,9 @@ def dry_run(
 
 def print_dry_run(plan: Callable[[Warn], tuple[Any, Any]], folder: Path, as_json: bool) -> None:
     """Print what a comparison will take."""
-    clock = SystemClock()
-    with events_shown(as_json) as sink:
-        expected = dry_run(plan, folder, Warnings(sink, clock), MachineSpeed())
-        sink(Done(expected, time=clock.now()))
-    if not as_json:
-        click.echo("\n".join(expected.lines()))
+    with answering(as_json) as answer:
+        expected = dry_run(plan, folder, answer.warn, MachineSpeed())
+        answer.done(expected, *expected.lines())
 
 
 def _memory(trial: Trial, data: TrialData, own_bytes: int) -> int:

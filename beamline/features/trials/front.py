@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from beamline.features.trials.figures import cost_curves, pareto_plot
-from beamline.features.trials.layout import TableColumn, TableLayout
+from beamline.features.trials.layout import TableColumn, TableLayout, metric_column
 from beamline.features.trials.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable, steps
 from beamline.features.trials.trial import Outcome
 from beamline.projections.scan_statistics import Light
@@ -147,14 +147,8 @@ def _of_trial(name: str) -> Callable[[Outcome], Any]:
 
 def _figure(name: str, length_unit: str) -> TableColumn:
     figure = _FIGURES[name]
-
-    def shown(outcome: Outcome) -> str:
-        value = outcome.metrics.get(name)
-        return "–" if value is None else figure.shown(value)
-
-    return TableColumn(
-        name, lambda o: o.metrics.get(name), figure.heading.format(length_unit), figure.short, 9, shown, metric=True
-    )
+    heading = figure.heading.format(length_unit)
+    return metric_column(name, lambda o: o.metrics.get(name), figure.shown, heading, figure.short, 9)
 
 
 def _names(table: TrialTable) -> list[str]:

@@ -186,11 +186,10 @@ def by_parts(count: int, data: TrialData, fit: Callable[[PreparedProjections], F
         parts = [np.flatnonzero(shown == energy) for energy in range(count)]
     volumes = np.stack([fit(data.prepared.of_views(at)) for at in parts])
     middles = np.array([shown[at].mean() for at in parts])
-    return lambda view: np.tensordot(_linear(view, middles), volumes, 1)
-
-
-def _linear(at: float, knots: F64) -> F32:
-    return np.array([np.interp(at, knots, row) for row in np.eye(knots.size)], np.float32)
+    shares = np.eye(middles.size)  # of the volumes, linear between the middles
+    return lambda view: np.tensordot(
+        np.array([np.interp(view, middles, row) for row in shares], np.float32), volumes, 1
+    )
 
 
 DATA = "data"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,6 +14,7 @@ from beamline.core.events import TrialDone
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.shipped import version
+from beamline.core.text import csv_text
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome
 from beamline.report.html import Picture, render
@@ -44,6 +43,23 @@ class TableColumn:
     width: int = 8
     shown: Callable[[Outcome], str] = lambda outcome: ""
     metric: bool = False
+
+
+def metric_column(
+    name: str,
+    value: Callable[[Outcome], float | None],
+    shown: Callable[[float], str],
+    heading: str,
+    short: str,
+    width: int,
+) -> TableColumn:
+    """The column of a figure of merit; `shown`: a value in words."""
+
+    def in_words(outcome: Outcome) -> str:
+        known = value(outcome)
+        return "–" if known is None else shown(known)
+
+    return TableColumn(name, value, heading, short, width, in_words, metric=True)
 
 
 @dataclass(frozen=True)
@@ -80,7 +96,7 @@ class TableLayout:
 
 
 def status_text(outcome: Outcome) -> str:
-    """What stands in place of figures."""
+    """Status and message of a trial without figures."""
     return f"{'left out' if outcome.trial.left_out else outcome.status}: {outcome.message}".rstrip(": ")
 
 
@@ -134,11 +150,8 @@ def records(table: TrialTable, layout: TableLayout) -> list[dict[str, Any]]:
 
 def to_csv(table: TrialTable, layout: TableLayout) -> str:
     """One line for each trial; a value that is not known is empty."""
-    out, rows = io.StringIO(), records(table, layout)
-    writer = csv.DictWriter(out, list(rows[0]) if rows else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue()
+    rows = records(table, layout)
+    return csv_text([list(rows[0]) if rows else [], *(row.values() for row in rows)])
 
 
 def write_page(folder: Path, table: TrialTable, layout: TableLayout, slices: SliceSheet) -> None:

@@ -170,7 +170,7 @@ def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Tri
 
 @dataclass(frozen=True)
 class Timed:
-    """A trial that is done, and where its time went.
+    """A finished trial, and how its time was spent.
 
     Attributes:
         wall: s, from before its process began to after its end.

@@ -18,7 +18,7 @@ from beamline.core.sinks import Warn
 from beamline.features.trials.figures import against_cost, figures_of_rows
 from beamline.features.trials.front import dose_columns
 from beamline.features.trials.launch import TrialData
-from beamline.features.trials.layout import TableColumn, TableLayout, records
+from beamline.features.trials.layout import TableColumn, TableLayout, metric_column, records
 from beamline.features.trials.runner import ComparedScan, Planned, RunLimits, opened_scan, run_comparison
 from beamline.features.trials.table import TrialTable
 from beamline.features.trials.trial import Outcome, Trial
@@ -217,11 +217,7 @@ def formatted(name: str, value: float) -> str:
 def _figure(name: str, shown: bool) -> TableColumn:
     heading = _FIGURES[name][0]
 
-    def in_words(outcome: Outcome) -> str:
-        value = value_of(name, outcome)
-        return "–" if value is None else formatted(name, value)
-
-    return TableColumn(name, partial(value_of, name), heading * shown, heading, 12, in_words, metric=True)
+    return metric_column(name, partial(value_of, name), partial(formatted, name), heading * shown, heading, 12)
 
 
 def _asked(outcome: Outcome) -> str:

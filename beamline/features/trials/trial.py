@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
@@ -121,34 +122,27 @@ def ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
     return {name: value for name, value in lengths.items() if has_setting(method, name)}
 
 
+_WORDS: Mapping[str, Callable[[Any], str]] = {
+    "steps": lambda n: f"{n} steps",
+    "gaussians": lambda n: thousands(n) if isinstance(n, int) else f"gaussians {n}",
+    "volumes": lambda n: f"{n} volumes",
+    "moves": lambda moves: f"motion {'chosen' if moves is None else 'learnt' if moves else 'none'}",
+    "states": lambda names: "smooth share",
+    "materials": lambda names: "",
+    "iterations": lambda n: count(n, "iteration"),
+    "fit.loss": lambda name: f"{name} loss",
+    "fit.ssim_weight": lambda weight: f"ssim_weight {weight}" if weight else "no SSIM",
+    "fit.kernel": lambda name: f"{name} kernel",
+}
+
+
 def _in_words(name: str, value: Plain | None) -> str:
-    match name, value:
-        case "steps", _:
-            return f"{value} steps"
-        case "gaussians", int():
-            return thousands(value)
-        case "volumes", _:
-            return f"{value} volumes"
-        case "moves", _:
-            return f"motion {'chosen' if value is None else 'learnt' if value else 'none'}"
-        case "states", _:
-            return "smooth share"
-        case "materials", _:
-            return ""
-        case "iterations", _:
-            return f"{value} iteration{'s' * (value != 1)}"
-        case "fit.loss", _:
-            return f"{value} loss"
-        case "fit.ssim_weight", 0:
-            return "no SSIM"
-        case "fit.kernel", _:
-            return f"{value} kernel"
-    return f"{name.rsplit('.', 1)[-1]} {value}"
+    return _WORDS[name](value) if name in _WORDS else f"{name.rsplit('.', 1)[-1]} {value}"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a trial.
+    """Result of a trial.
 
     Attributes:
         status: only "done" comes with figures.

@@ -17,7 +17,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,7 @@ def run(
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
             result = reconstruct(trial, prepared, grid, seed, control)
-        volume_at = result.at or partial(_always, on_grid(result.volume, grid).data)
+        volume_at = result.at or _always(on_grid(result.volume, grid).data)
         judged = residual_curve(history_arrays(result.history))
     cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
@@ -100,7 +99,7 @@ def run(
         "metrics": {name: float(value) for name, value in figures.items()},
         "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
         "squared_residuals": squared,
-        "curve": [] if result is None else curve_of(result),
+        "curve": [] if judged is None else np.transpose(record(judged.seconds, judged.residuals)).tolist(),
         "curve_of": "" if judged is None else judged.views,
         "reached": "" if result is None else reached(result),
         "message": "; ".join(dict.fromkeys(str(one.message) for one in warned)),
@@ -141,9 +140,9 @@ def measured(
     return figures, squared
 
 
-def _always(volume: F32, key: float) -> F32:
+def _always(volume: F32) -> VolumeAt:
     """The one volume, whenever a view was taken."""
-    return volume
+    return lambda view: volume
 
 
 def ready(trial: Trial, geometry: Geometry) -> None:
@@ -223,15 +222,6 @@ def on_grid(volume: Volume, grid: Grid) -> Volume:
         where = np.stack((np.full_like(plane[0], height), *plane))
         ndimage.map_coordinates(volume.data, where, out[k], order=1, mode="nearest")
     return Volume(out, grid)
-
-
-def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
-    """(seconds, dB) of the fit's own record, by views held out where there are any, else by those it used."""
-    curve = residual_curve(history_arrays(result.history))
-    if curve is None:
-        return []
-    seconds, quality = record(curve.seconds, curve.residuals)
-    return list(zip(seconds.tolist(), quality.tolist(), strict=True))
 
 
 def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,17 +22,16 @@ from beamline.cli.options import (
     volume_path,
 )
 from beamline.cli.selection_options import underscored
-from beamline.cli.terminal import Terminal, counting, events_shown
+from beamline.cli.terminal import Terminal, answering
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done, Sink
 from beamline.core.stop import StopRequest, stop_signals
-from beamline.features.xafs.curves_command import CurveJob, CurveOptions, run_job
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.core.flag import PixelBox
     from beamline.features.xafs.results import XafsResult
-    from beamline.features.xafs.series import SeriesResult
+    from beamline.features.xafs.series import CurveJob, SeriesResult
 
 _OF_SCENES = ("step", "material", "angle", "seed", "charges")
 _OF_FILES = ("regions", "around", "unit", "quantity")
@@ -149,11 +147,10 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
         return
     _refuse_given(_OF_MAPS, "a map of volumes: give --volume PATH, too")
     jobs = [job for source in sources for job in _jobs(source, values["regions"], values["charges"])]
-    options = CurveOptions(**{field.name: values[field.name] for field in fields(CurveOptions)})
     stop = StopRequest()
     with json_events(as_json) as json_sink, stop_signals(stop):
         refuse_existing_results(target)
-        results, stopped = _curves(jobs, options, stop, json_sink if as_json else None)
+        results, stopped = _curves(jobs, values, stop, json_sink if as_json else None)
         shown_lines = _write(results, len(jobs), target, stopped, json_sink)
     if not as_json:
         click.echo("\n".join(shown_lines))
@@ -167,18 +164,20 @@ def xafs(sources: tuple[str, ...], output: Path | None, volume: Path | None, as_
 
 
 def _curves(
-    jobs: Sequence[CurveJob], options: CurveOptions, stop: StopRequest, json_sink: Sink | None
+    jobs: Sequence[CurveJob], given: Mapping[str, Any], stop: StopRequest, json_sink: Sink | None
 ) -> tuple[list[XafsResult], bool]:
     """The edges of the curves, and whether a stop left some of them out.
 
     Raises:
         ScanStopped: before there was one.
     """
+    from beamline.features.xafs.series import run_job
+
     stopped = False
     results: list[XafsResult] = []
     with Terminal(sys.stderr) as terminal:
         for job in jobs:
-            run, title = run_job(job, options, len(jobs) > 1, json_sink or terminal, stop)
+            run, title = run_job(job, given, len(jobs) > 1, json_sink or terminal, stop)
             try:
                 results.append(_result(title, run))
             except ScanStopped:
@@ -192,21 +191,17 @@ def _curves(
 
 def _write(results: Sequence[XafsResult], jobs: int, target: Path, stopped: bool, json_sink: Sink) -> list[str]:
     """Write picture and table, send the event `done`, and return the lines to print."""
-    from beamline.features.xafs import states
-    from beamline.features.xafs.results import lines, table_beside, write, write_both
+    from beamline.features.xafs.results import table_beside, write_results
 
-    if jobs == 1:
-        write(results[0], target)
-        shown_lines, data = lines(results[0]), results[0].data()
-    else:
-        write_both(states.picture(results), states.table(results), target)
-        shown_lines, data = states.lines(results), states.data(results)
+    shown_lines, data = write_results(results, target, several=jobs > 1)
     data |= {"picture": target, "table": table_beside(target), "stopped": stopped}
     json_sink(Done(data, time=SystemClock().now()))
     return [*shown_lines, f"written     {target}, {table_beside(target)}"]
 
 
 def _jobs(source: str, regions: Sequence[PixelBox], charges: Sequence[float] | None) -> list[CurveJob]:
+    from beamline.features.xafs.series import CurveJob
+
     if CurveJob(source).is_scene:
         _refuse_given(_OF_FILES, "measured files, not for scenes")
         return [CurveJob(source, charge=charge) for charge in charges or (None,)]
@@ -226,21 +221,19 @@ def _charge_map(
     _refuse_given((*_OF_FILES, *_OF_SCENES, "low", "high"), "curves, and --volume makes a map")
     paths = [Path(source) for source in sources]
     refuse_shared({"--volume": volume, "--output": target, **{f"FILE {n}": path for n, path in enumerate(paths, 1)}})
-    with events_shown(as_json) as sink:
-        clock = SystemClock()
+    with answering(as_json) as answer:
         for path in (volume, target):
             refuse_existing(path)
         table = None if spectra is None else read_spectra(spectra)
-        charge = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
+        charge = charge_map(paths, table, least, answer.counting("slices"), answer.clock.now())
         drawn = picture(charge)
         with ExitStack() as undo:
             write_volume(volume, charge.record)
             undo.callback(remove, volume)
             write_whole(target, drawn)
             undo.pop_all()
-        sink(Done({"volume": volume, "picture": target, **charge.data()}, time=clock.now()))
-    if not as_json:
-        click.echo("\n".join([*charge.lines(), f"written     {volume}, {target}"]))
+        facts = {"volume": volume, "picture": target, **charge.data()}
+        answer.done(facts, *charge.lines(), f"written     {volume}, {target}")
 
 
 def _result(title: str, run: SeriesResult) -> XafsResult:

@@ -6,8 +6,6 @@ a few electronvolts higher: the white line of a nickel oxide, 8348.5 eV, is 16 e
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -17,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamline.core.files import refuse_existing, write_whole
+from beamline.core.text import csv_text
 from beamline.features.xafs.contrast import AbsorptionEdge, XafsCurve
-from beamline.report.figures import WIDTH, new_figure, png
+from beamline.report.figures import WIDTH, new_figure, one_panel, png
 from recon.prep.matter import HEAVIEST, TabulatedEdge, edges_of
 
 if TYPE_CHECKING:
@@ -119,11 +118,8 @@ def table(curve: XafsCurve) -> str:
         columns |= {"contrast": curve.contrast, "noise": curve.noise}
     if (cnr := curve.contrast_to_noise) is not None:
         columns["contrast_to_noise"] = cnr
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True))
-    return out.getvalue()
+    rows = ([f"{value:.9g}" for value in row] for row in zip(*columns.values(), strict=True))
+    return csv_text([columns, *rows])
 
 
 def picture(result: XafsResult) -> bytes:
@@ -165,9 +161,20 @@ def refuse_existing_results(target: Path) -> None:
         refuse_existing(path)
 
 
-def write(result: XafsResult, target: Path) -> None:
-    """The picture and the table beside it; errors as those of `write_both`."""
+def write_results(
+    results: Sequence[XafsResult], target: Path, *, several: bool = False
+) -> tuple[list[str], dict[str, Any]]:
+    """Write the picture and the table beside it of a curve, or of several; errors as those of `write_both`.
+
+    Returns:
+        Sentences for people, and values for programs.
+    """
+    if several:
+        write_both(picture_of_several(results), table_of_several(results), target)
+        return lines_of_several(results), {"states": [result.data() for result in results]}
+    (result,) = results
     write_both(picture(result), table(result.curve), target)
+    return lines(result), result.data()
 
 
 def write_both(drawn: bytes, text: str, target: Path) -> None:
@@ -225,3 +232,61 @@ def edge_sentence(material: str, elements: Sequence[int], low: float, high: floa
 
 def _within(edges: Sequence[TabulatedEdge], low: float, high: float) -> list[TabulatedEdge]:
     return [each for each in edges if low <= each.energy <= high]
+
+
+_COLOURS = "viridis"
+_MOST_LABELS = 12  # in a legend; more colours nobody tells apart
+
+
+def lines_of_several(states: Sequence[XafsResult]) -> list[str]:
+    """A line for each state: its edge, its white line, and how far the edge is from that of the first."""
+    width = max(len(state.title) for state in states)
+    first, text = states[0].edge.energy, list[str]()
+    for state in states:
+        edge = state.edge
+        if edge.energy is None:
+            why = "; ".join(part for part in (edge.reason, state.tabulated) if part)
+            text.append(f"{state.title:<{width}}  no edge: {why}")
+            continue
+        top = "no white line" if edge.white_line is None else f"white line {edge.white_line:.4f} keV"
+        apart = "" if first is None or state is states[0] else f", {(edge.energy - first) * 1e3:+.2f} eV from the first"
+        text.append(f"{state.title:<{width}}  edge {edge.energy:.4f} keV, {top}{apart}")
+    if first is not None and states[0].tabulated:
+        text.append(f"{'in tables':<{width}}  {states[0].tabulated}")
+    return text
+
+
+def table_of_several(states: Sequence[XafsResult]) -> str:
+    """CSV: each state's name, an energy and the absorption there, state after state."""
+    rows = (
+        [state.title, f"{energy:.9g}", f"{absorption:.9g}"]
+        for state in states
+        for energy, absorption in zip(state.curve.energies, state.curve.absorption, strict=True)
+    )
+    return csv_text([["state", "energy_kev", f"absorption ({_unit(states)})"], *rows])
+
+
+def picture_of_several(states: Sequence[XafsResult]) -> bytes:
+    """PNG: all curves over energy, and the edge (dashed) and the white line (dotted) of each in its colour."""
+    from matplotlib import colormaps
+
+    figure, axes = one_panel(4.6)
+    shades = np.linspace(0, 0.9, len(states))
+    named = set(np.linspace(0, len(states) - 1, _MOST_LABELS).round().astype(int))
+    for n, (state, shade) in enumerate(zip(states, shades, strict=True)):
+        colour, edge = colormaps[_COLOURS](shade), state.edge
+        where = "no edge" if edge.energy is None else f"edge {edge.energy:.4f} keV"
+        label = f"{state.title}: {where}" if n in named else None
+        axes.plot(state.curve.energies, state.curve.absorption, color=colour, lw=1.2, marker=".", ms=3, label=label)
+        for energy, style in ((edge.energy, "--"), (edge.white_line, ":")):
+            if energy is not None:
+                axes.axvline(energy, color=colour, lw=1.0, ls=style)
+    axes.set(xlabel="energy (keV)", ylabel=f"absorption ({_unit(states)})")
+    axes.set_title("edges dashed, white lines dotted", fontsize=9)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    return png(figure)
+
+
+def _unit(states: Sequence[XafsResult]) -> str:
+    return " or ".join(dict.fromkeys(state.curve.unit for state in states))

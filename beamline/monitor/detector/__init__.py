@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 CHECKS = {
-    "beamline.monitor.detector.bands": "BandsCheck",
-    "beamline.monitor.detector.gain": "GainCheck",
-    "beamline.monitor.detector.blur": "BlurCheck",
-    "beamline.monitor.detector.zingers": "ZingersCheck",
+    "BandsCheck": "beamline.monitor.detector.bands",
+    "GainCheck": "beamline.monitor.detector.light",
+    "BlurCheck": "beamline.monitor.detector.blur",
+    "ZingersCheck": "beamline.monitor.detector.light",
 }

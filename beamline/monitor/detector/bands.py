@@ -17,7 +17,7 @@ import pydantic
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
-from beamline.monitor.check import AGAIN, Flag, Level, Look, Policy, ScanContext, light
+from beamline.monitor.check import AGAIN, Flag, Level, Logged, Look, ScanContext, light
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 
@@ -71,7 +71,7 @@ class BandsState:
 
 
 @dataclass(frozen=True)
-class BandsCheck:
+class BandsCheck(Logged):
     """Score: fraction of its light that a preview row or column has lost (negative: gained).
 
     The default limit comes from two black rows across two preview blocks of 8: they take an eighth of the light of
@@ -82,7 +82,6 @@ class BandsCheck:
     bit: ClassVar[int] = 3
     unit: ClassVar[str] = "fraction of the line's light"
     meaning: ClassVar[str] = "rows or columns lost or gained light against their own past while the others did not"
-    policy: ClassVar[Policy] = Policy.LOG
 
     alarm: Annotated[
         float,

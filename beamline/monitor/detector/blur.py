@@ -16,12 +16,11 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
+from beamline.monitor.change import FrameScatter, running_mean
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import FrameScatter, running_mean
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
-from recon.base.jit import njit
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
 STRIP = 6  # neighbouring rows that are used together
@@ -51,7 +50,7 @@ class BlurState:
 
 
 @dataclass(frozen=True)
-class BlurCheck:
+class BlurCheck(Logged):
     """Score: share of its fine contrast that a view has lost against the views before.
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
@@ -62,7 +61,6 @@ class BlurCheck:
     bit: ClassVar[int] = 14
     unit: ClassVar[str] = "share of the fine contrast"
     meaning: ClassVar[str] = "the view is less sharp than the views before"
-    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[
         float, pydantic.Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")
@@ -128,11 +126,10 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
         light = flat - low
         lit = light > DARKEST * max(float(light.mean()), 0.0)
         scale = np.divide(1, light, out=np.zeros_like(light), where=lit)
-    sums = np.zeros(4)
-    _contrasts(lines, low, scale, min(STRIP, len(lines)), sums)
-    return tuple(  # type: ignore[return-value]
-        float(near / far) if far > 0 else math.nan for near, far in (sums[:2], sums[2:])
-    )
+    strip = min(STRIP, len(lines))
+    shape, used = (-1, strip, lines.shape[1]), len(lines) // strip * strip
+    seen, lit = ((lines - low) * scale)[:used].reshape(shape), (scale > 0)[:used].reshape(shape)
+    return _ratio(seen, lit), _ratio(seen.swapaxes(1, 2), lit.swapaxes(1, 2))
 
 
 def _lines(frame: Frame) -> NDArray[Any]:
@@ -167,46 +164,11 @@ def _loss(now: float, usual: FrameScatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 
-@njit(nogil=True, inline="always")
-def _clipped(x, most):
-    return min(max(x, -most), most)
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _product(one, two):
-    total = np.float32(0)
-    for i in range(one.size):
-        total += one[i] * two[i]
-    return total
-
-
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _contrasts(lines, dark, scale, strip, sums):
-    """Fills `sums`: near and far along the rows, near and far along the columns."""
-    rows, cols = lines.shape
-    light, lit = np.empty((strip, cols), np.float32), np.empty((strip, cols), np.float32)
-    steepest = np.float32(STEEPEST)
-    near, far = np.empty((2, cols), np.float32), np.empty((2, cols), np.float32)  # of a row and the one before
-    for top in range(0, rows - strip + 1, strip):
-        for row in range(strip):
-            for col in range(cols):
-                light[row, col] = (np.float32(lines[top + row, col]) - dark[top + row, col]) * scale[top + row, col]
-                lit[row, col] = np.float32(scale[top + row, col] > 0)
-        for row in range(strip):
-            now, before, full = row % 2, 1 - row % 2, lit[row]
-            x = light[row]
-            for col in range(cols - FAR):
-                known = full[col] * full[col + FAR // 2] * full[col + FAR]
-                near[now, col] = known * _clipped(x[col] - 2 * x[col + FAR // 2] + x[col + FAR], steepest)
-                far[now, col] = known * _clipped(x[col + FAR] - x[col], steepest)
-            if row > 0:
-                sums[0] += _product(near[now, : cols - FAR], near[before, : cols - FAR])
-                sums[1] += _product(far[now, : cols - FAR], far[before, : cols - FAR])
-        for row in range(strip - FAR):
-            one, two, three = light[row], light[row + FAR // 2], light[row + FAR]
-            for col in range(cols):
-                known = lit[row, col] * lit[row + FAR // 2, col] * lit[row + FAR, col]
-                near[0, col] = known * _clipped(one[col] - 2 * two[col] + three[col], steepest)
-                far[0, col] = known * _clipped(three[col] - one[col], steepest)
-            sums[2] += _product(near[0, 1:], near[0, :-1])
-            sums[3] += _product(far[0, 1:], far[0, :-1])
+def _ratio(light: CellValues, lit: NDArray[np.bool_]) -> float:
+    """Contrast of second differences along the last axis, over that of first ones; NaN without any."""
+    n = max(light.shape[-1] - FAR, 0)
+    first, middle, last = (light[..., i : i + n] for i in (0, FAR // 2, FAR))
+    known = lit[..., :-FAR] & lit[..., FAR // 2 : -FAR // 2] & lit[..., FAR:]
+    steps = (known * np.clip(each, -STEEPEST, STEEPEST) for each in (first - 2 * middle + last, last - first))
+    near, far = (float(np.vdot(step[:, 1:], step[:, :-1])) for step in steps)
+    return near / far if far > 0 else math.nan

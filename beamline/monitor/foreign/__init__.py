@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 CHECKS = {
-    "beamline.monitor.foreign.floater": "FloaterCheck",
-    "beamline.monitor.foreign.ghost": "GhostCheck",
-    "beamline.monitor.foreign.model": "ModelCheck",
+    "FloaterCheck": "beamline.monitor.foreign.floater",
+    "GhostCheck": "beamline.monitor.foreign.ghost",
+    "ModelCheck": "beamline.monitor.foreign.model",
 }

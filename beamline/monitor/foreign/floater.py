@@ -16,7 +16,7 @@ import pydantic
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.change import MOST_STEPS
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.foreign.track import Octave, SampleMotion, Track, tracks_of, with_view
 from beamline.monitor.view import CellGrid
@@ -71,14 +71,13 @@ class FloaterState:
 
 
 @dataclass(frozen=True)
-class FloaterCheck:
+class FloaterCheck(Logged):
     """Score: the sum along the track in standard deviations."""
 
     name: ClassVar[str] = "floater"
     bit: ClassVar[int] = 10
     unit: ClassVar[str] = "standard deviations"
     meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
-    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, pydantic.Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
 

@@ -16,12 +16,11 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, again_by
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import CellValues
+from beamline.monitor.view import CellValues, sums_of_places
 from drivers.base.frame import Frame
 from recon.base.arrays import median_deviation
-from recon.base.jit import njit
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
@@ -99,29 +98,11 @@ def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Rea
     return Filters(np.ascontiguousarray(weights, np.float32), strength, speeds)
 
 
-@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def correlate(views, weights, out):
-    """out[signal, row, col] of views [lag, row, col]; beyond the frame's edges it goes on as at the edge.
-
-    The taps are written out: the sum then stays in a register, which halves the time.
-    """
-    signals, lags, _ = weights.shape
-    rows, cols = views.shape[1:]
-    wide = np.empty(cols + 2 * REACH, np.float32)
-    out[:] = 0.0
-    for row in range(rows):
-        for lag in range(lags):
-            wide[:REACH] = views[lag, row, 0]
-            for i in range(cols):  # assigning slices would compile numba's check of shapes, which takes seconds
-                wide[REACH + i] = views[lag, row, i]
-            wide[REACH + cols :] = views[lag, row, cols - 1]
-            for signal in range(signals):
-                w, target = weights[signal, lag], out[signal, row]
-                for i in range(cols):
-                    total = w[0] * wide[i] + w[1] * wide[i + 1] + w[2] * wide[i + 2] + w[3] * wide[i + 3]
-                    total += w[4] * wide[i + 4] + w[5] * wide[i + 5] + w[6] * wide[i + 6] + w[7] * wide[i + 7]
-                    total += w[8] * wide[i + 8] + w[9] * wide[i + 9] + w[10] * wide[i + 10] + w[11] * wide[i + 11]
-                    target[i] += total + w[12] * wide[i + 12]
+def correlate(views: CellValues, weights: CellValues) -> CellValues:
+    """[signal, row, col] of views [lag, row, col]; beyond the frame's edges it goes on as at the edge."""
+    wide = np.pad(views, ((0, 0), (0, 0), (REACH, REACH)), mode="edge")
+    places = np.lib.stride_tricks.sliding_window_view(wide, 2 * REACH + 1, axis=2)
+    return np.tensordot(weights, places, ((1, 2), (0, 3)))
 
 
 class Peak(NamedTuple):
@@ -150,7 +131,7 @@ class GhostState:
 
 
 @dataclass(frozen=True)
-class GhostCheck:
+class GhostCheck(Logged):
     """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
     ghost that leaves a place looks like a shadow that comes.
     """
@@ -161,7 +142,6 @@ class GhostCheck:
     meaning: ClassVar[str] = (
         "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
     )
-    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[
         float, pydantic.Field(ge=0, description="relative change of the light in the middle of the ghost")
@@ -190,8 +170,7 @@ class GhostCheck:
         if not state.filters.speeds.size:
             return Look(state)
         chosen = np.stack([state.profiles[-1 + lag * stride] for lag in LAGS])
-        outputs = np.empty((state.filters.speeds.size, *chosen.shape[1:]), np.float32)
-        correlate(chosen, state.filters.weights, outputs)
+        outputs = correlate(chosen, state.filters.weights)
         return self._judge(state, frame.index, outputs, radius * step / (COLUMNS / 2), context)
 
     def _judge(
@@ -233,12 +212,8 @@ class GhostCheck:
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
     """Mean line integral of the cells that are lit [part of the rows, broad column]."""
-    starts = np.arange(min(PARTS, depth.shape[0])) * depth.shape[0] // min(PARTS, depth.shape[0])
-    columns = np.arange(COLUMNS) * depth.shape[1] // COLUMNS
-    sums, lit = (
-        np.add.reduceat(np.add.reduceat(x, starts, axis=0), columns, axis=1)
-        for x in (depth, (weight > 0).astype(np.float32))
-    )
+    lit = (weight > 0).astype(np.float32)
+    sums, lit = (sums_of_places(each, min(PARTS, depth.shape[0]), COLUMNS) for each in (depth, lit))
     return np.asarray(sums / np.maximum(lit, 1), np.float32)
 
 

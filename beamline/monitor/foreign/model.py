@@ -15,7 +15,7 @@ import numpy as np
 import pydantic
 import scipy
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues, cell_noise
 from drivers.base.frame import Frame
@@ -36,7 +36,7 @@ class ModelState:
 
 
 @dataclass(frozen=True)
-class ModelCheck:
+class ModelCheck(Logged):
     """Score: largest difference from the volume, in standard deviations of the usual difference at its place.
 
     The default: a frame has up to 18,000 cells; noise takes one of them beyond 5 standard deviations in 100 views.
@@ -47,7 +47,6 @@ class ModelCheck:
     bit: ClassVar[int] = 33
     unit: ClassVar[str] = "standard deviations"
     meaning: ClassVar[str] = "a part of the view differs from the render of the reconstruction that was given"
-    policy: ClassVar[Policy] = Policy.LOG
 
     warn: Annotated[float, pydantic.Field(ge=0, description="standard deviations by which a part may differ")] = 6.0
 

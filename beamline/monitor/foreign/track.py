@@ -36,7 +36,6 @@ SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 c
 KERNEL = np.exp(-0.5 * (np.arange(-2, 3) / SIZE) ** 2).astype(np.float32)
 KERNEL /= np.sqrt((KERNEL**2).sum())  # white noise keeps its variance
 KERNEL_ROWS = KERNEL[1:4] / np.sqrt((KERNEL[1:4] ** 2).sum())
-ONE = np.ones(1, np.float32)
 SAMPLED = 3  # cells, of which one is enough for the noise
 SPIKE = 6.0  # standard deviations between the neighbours: the brighter one has a zinger, or an edge passes
 COMMON = 8  # cells of a row or column that give its common change
@@ -155,14 +154,20 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
 def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, float]:
     """What the neighbours do not explain, without what rows and columns have in common, smoothed; and the standard
     deviation of its noise in a cell of weight 1."""
-    change, smooth = np.empty_like(own), np.empty_like(own)
-    sample = np.empty(own.size // SAMPLED + own.shape[0], np.float32)
-    n = _second(before, own, after, weight, np.float32(np.inf), change, sample)
-    noise = max(median_deviation(sample[:n]) if n else 1.0, LEAST_NOISE)
-    _second(before, own, after, weight, np.float32((SPIKE * noise) ** 2), change, sample)
-    _take_common(change, weight, np.float32(OUTLIER * noise), COMMON)
-    _smooth(change, KERNEL, KERNEL_ROWS if own.shape[0] >= KERNEL_ROWS.size else ONE, smooth)
-    return smooth, noise
+    lit, root, apart = weight > LIT, np.sqrt(weight), before - after
+    change = (own - 0.5 * (before + after)) * lit
+    sample = (change * root).ravel()[::SAMPLED][lit.ravel()[::SAMPLED]]
+    noise = max(median_deviation(sample) if sample.size else 1.0, LEAST_NOISE)
+    # The darker neighbour alone, where the other is far brighter.
+    change -= 0.5 * np.abs(apart) * (apart * apart * weight > (SPIKE * noise) ** 2) * lit
+    for axis in (0, 1):
+        if change.shape[axis] >= COMMON:
+            common = (np.clip(change * root, -OUTLIER * noise, OUTLIER * noise) * root).sum(axis, keepdims=True)
+            change -= common / (weight.sum(axis, keepdims=True) + LIT) * lit
+    change = scipy.ndimage.correlate1d(change, KERNEL, axis=1, mode="constant")
+    if len(change) >= KERNEL_ROWS.size:
+        change = scipy.ndimage.correlate1d(change, KERNEL_ROWS, axis=0, mode="constant")
+    return change, noise
 
 
 def _noise(
@@ -170,13 +175,14 @@ def _noise(
 ) -> tuple[CellValues, CellValues]:
     """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass
     deviate usually, there and beside."""
+    least = np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
     if usual is None:
-        usual = scipy.ndimage.uniform_filter(change**2, 5, mode="nearest")
-        usual = np.maximum(usual, np.float32(noise**2) / np.maximum(weight, np.float32(LIT)))
-        newest = 0.0
-    after, deviation = np.empty_like(usual), np.empty_like(usual)
-    _usual(change, weight, np.float32(noise**2), usual, np.float32(newest), after, deviation)
-    return deviation, after
+        usual = np.maximum(scipy.ndimage.uniform_filter(change**2, 5, mode="nearest"), least)
+    else:
+        usual = usual + np.float32(newest) * (np.minimum(change**2, OUTLIER**2 * usual) - usual)
+    high = np.maximum(usual, scipy.ndimage.uniform_filter1d(usual, 3, axis=0, mode="nearest"))
+    high = scipy.ndimage.maximum_filter1d(high, 3, axis=1, mode="nearest")
+    return np.sqrt(np.maximum(high, 0.25 * least)), usual
 
 
 def tracks_of(octave: Octave, sample: SampleMotion, least: float) -> list[Track]:
@@ -189,15 +195,31 @@ def tracks_of(octave: Octave, sample: SampleMotion, least: float) -> list[Track]
     speeds = np.arange(SLOWEST, fastest + APART, APART)
     speeds = np.concatenate([speeds, -speeds])
     offsets = np.rint(speeds[:, None] * np.arange(SEED)).astype(np.int64)
-    best, seeds = np.empty((rows, cols), np.float32), np.empty((512, 4))
+    best = np.empty((rows, cols), np.float32)
     newest = np.minimum(newest, np.float32(CLIP))
     _highest(newest, offsets, best)
-    n = _seeds(newest, offsets, np.float32(PROMISING), best, seeds)
-    highest = seeds[:n][np.argsort(-seeds[:n, 3])[:MOST_SEEDS]]
     tracks = [
-        _track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest
+        _track(octave, row, float(col), speeds[_fastest(newest[:, row], offsets, col)] / octave.views, sample, least)
+        for row, col in _seeds(best)
     ]
     return sorted((track for track in tracks if track is not None), key=lambda track: -track.score)
+
+
+def _seeds(best: CellValues) -> list[tuple[int, int]]:
+    """Row and column of the highest local maxima of the sums over SEED steps, the highest first."""
+    rows, cols = np.divmod(np.flatnonzero(best > 2 * PROMISING), best.shape[1])
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(best, ((1, 1), (2, 2))), (3, 5))
+    peak = best[rows, cols] >= windows[rows, cols].max(axis=(1, 2), initial=0)
+    order = np.argsort(-best[rows, cols][peak], kind="stable")[:MOST_SEEDS]
+    return list(zip(rows[peak][order].tolist(), cols[peak][order].tolist(), strict=True))
+
+
+def _fastest(steps: CellValues, offsets: NDArray[np.int64], col: int) -> int:
+    """Which line [speed, step] that ends in this column has the largest sum of steps [step, col]."""
+    at = col - offsets
+    inside = (at[:, -1] >= 0) & (at[:, -1] < steps.shape[1])
+    sums = steps[np.arange(SEED), at.clip(0, steps.shape[1] - 1)].sum(axis=1)
+    return int(np.where(inside, sums, -np.inf).argmax())
 
 
 def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMotion, least: float) -> Track | None:
@@ -238,97 +260,6 @@ def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) ->
     return float(np.mean((depth - mean) ** 2 / (1 / weight + (UNEVEN * mean) ** 2)))
 
 
-@njit(nogil=True, cache=True)
-def _second(before, own, after, weight, spike, change, sample):
-    """Fills `change`: own less the mean of the neighbours, or less the darker one where their squares of the difference
-    are above `spike` over the weight. `sample` gets deviations of cells with light: their number."""
-    n = 0
-    for row in range(own.shape[0]):
-        one, two, three, w, out = before[row], own[row], after[row], weight[row], change[row]
-        for col in range(own.shape[1]):
-            apart = one[col] - three[col]
-            reference = np.float32(0.5) * (one[col] + three[col])
-            reference += np.float32(0.5) * abs(apart) * np.float32(apart * apart * w[col] > spike)
-            out[col] = (two[col] - reference) * np.float32(w[col] > np.float32(LIT))
-        for col in range(row % SAMPLED, own.shape[1], SAMPLED):
-            if w[col] > np.float32(LIT):
-                sample[n] = abs(out[col]) * np.sqrt(w[col])
-                n += 1
-    return n
-
-
-@njit(nogil=True, cache=True)
-def _take_common(change, weight, most, least):
-    """Takes off the mean of each column, then of each row, of changes up to `most` standard deviations; where there are
-    `least` cells."""
-    rows, cols = change.shape
-    if rows >= least:
-        total, light = np.zeros(cols, np.float32), np.full(cols, np.float32(LIT))
-        for row in range(rows):
-            for col in range(cols):
-                root = np.sqrt(weight[row, col])
-                total[col] += min(max(change[row, col] * root, -most), most) * root
-                light[col] += weight[row, col]
-        for row in range(rows):
-            for col in range(cols):
-                change[row, col] -= total[col] / light[col] * np.float32(weight[row, col] > np.float32(LIT))
-    if cols >= least:
-        for row in range(rows):
-            total_row, light_row = np.float32(0), np.float32(LIT)
-            for col in range(cols):
-                root = np.sqrt(weight[row, col])
-                total_row += min(max(change[row, col] * root, -most), most) * root
-                light_row += weight[row, col]
-            for col in range(cols):
-                change[row, col] -= total_row / light_row * np.float32(weight[row, col] > np.float32(LIT))
-
-
-@njit(nogil=True, cache=True)
-def _smooth(change, across, down, out):
-    """Correlated with a kernel along the columns and one along the rows; 0 beyond the edges."""
-    rows, cols = change.shape
-    half, reach = across.size // 2, down.size // 2
-    wide, line = np.zeros(cols + 2 * half, np.float32), np.empty((rows, cols), np.float32)
-    for row in range(rows):
-        for col in range(cols):
-            wide[half + col] = change[row, col]
-        target = line[row]
-        target[:] = 0
-        for k in range(across.size):
-            tap, part = across[k], wide[k : k + cols]
-            for col in range(cols):
-                target[col] += tap * part[col]
-    for row in range(rows):
-        target = out[row]
-        target[:] = 0
-        for k in range(down.size):
-            at = row + k - reach
-            if 0 <= at < rows:
-                tap, part = down[k], line[at]
-                for col in range(cols):
-                    target[col] += tap * part[col]
-
-
-@njit(nogil=True, cache=True)
-def _usual(change, weight, noise, usual, newest, after, deviation):
-    """Fills `after`, the usual square with this change's, whose weight is `newest`, and `deviation`, its root: the
-    highest of a cell and its neighbours, and of their means over three rows."""
-    rows, cols = change.shape
-    for row in range(rows):
-        for col in range(cols):
-            now, was = change[row, col] * change[row, col], usual[row, col]
-            after[row, col] = was + newest * (min(now, np.float32(OUTLIER * OUTLIER) * was) - was)
-    high = np.empty(cols + 2, np.float32)
-    for row in range(rows):
-        above, own, below = after[max(row - 1, 0)], after[row], after[min(row + 1, rows - 1)]
-        for col in range(cols):
-            high[col + 1] = max(own[col], (above[col] + own[col] + below[col]) / np.float32(3))
-        high[0], high[cols + 1] = high[1], high[cols]
-        for col in range(cols):
-            least = np.float32(0.25) * noise / max(weight[row, col], np.float32(LIT))
-            deviation[row, col] = np.sqrt(max(max(high[col], high[col + 1]), max(high[col + 2], least)))
-
-
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
 def _highest(steps, offsets, best):
     """Fills `best` with the largest sum of four steps along the lines that end at each cell."""
@@ -343,35 +274,6 @@ def _highest(steps, offsets, best):
             four = steps[3, row, low - offsets[k, 3] : high - offsets[k, 3]]
             for i in range(high - low):
                 line[i] = max(line[i], (one[i] + two[i]) + (three[i] + four[i]))
-
-
-@njit(nogil=True, cache=True)
-def _seeds(steps, offsets, least, best, seeds):
-    """Fills `seeds` with (row, col, speed's number, score) of the local maxima above `least`: their number."""
-    _, rows, cols = steps.shape
-    n = 0
-    for row in range(rows):
-        for col in range(cols):
-            own = best[row, col]
-            if own <= 2 * least:
-                continue
-            highest = True
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(col - 2, 0), min(col + 3, cols)):
-                    if best[r, c] > own:
-                        highest = False
-            if highest and n < seeds.shape[0]:
-                seeds[n, 0], seeds[n, 1], seeds[n, 2], seeds[n, 3] = row, col, 0, own / 2
-                most = np.float32(0)
-                for k in range(offsets.shape[0]):
-                    if 0 <= col - offsets[k, 3] < cols:
-                        total = (steps[0, row, col] + steps[1, row, col - offsets[k, 1]]) + (
-                            steps[2, row, col - offsets[k, 2]] + steps[3, row, col - offsets[k, 3]]
-                        )
-                        if total > most:
-                            most, seeds[n, 2] = total, k
-                n += 1
-    return n
 
 
 @njit(nogil=True, cache=True)

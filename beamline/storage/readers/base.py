@@ -84,6 +84,15 @@ class ScanSource(ABC):
         numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
         pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
+        not_used: what the file states of geometry, units, order and validity, and what is not used.
+        used: what it states of each frame, and of exposure, current, energy and geometry, and what is used.
+        energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
+        currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
+            NaN where unknown, None where there is no monitor.
+        emission: the counts of a sample that emits, whose line integrals the pixels are; None: it does not emit.
+        plan: the requested scan, as our files record it; empty if unknown.
+        row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
+        stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
     """
 
     path: Path
@@ -106,15 +115,19 @@ class ScanSource(ABC):
     numbers: NDArray[np.int64] | None = None
     pixel_mask: Mask | None = None
     frames_per_view: int = 1
+    not_used: tuple[NotUsed, ...] = ()
+    used: tuple[Used, ...] = ()
+    energies: NDArray[np.float64] | None = None
+    currents: NDArray[np.float64] | None = None
+    emission: EmissionOf | None = None
+    plan: Mapping[str, Any] = MappingProxyType({})
+    row_period: float | None = None
+    stated_shifts: NDArray[np.float64] | None = None
+    stated_ending: ScanEnding = ScanEnding()
 
     @property
     def angle_text(self) -> tuple[str, str] | None:
         """Name and content of a text with the angles that lies beside the frames, or None."""
-        return None
-
-    @property
-    def row_period(self) -> float | None:
-        """s from the exposure of a row to that of the next; 0: all together, None: unknown."""
         return None
 
     @property
@@ -130,7 +143,7 @@ class ScanSource(ABC):
     @property
     def ending(self) -> ScanEnding:
         """How the scan ended, as far as the file tells; a copy states the same."""
-        return ScanEnding()
+        return self.stated_ending
 
     @property
     def attributes(self) -> Attributes:
@@ -138,31 +151,8 @@ class ScanSource(ABC):
         return self.facts
 
     @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        """What the file states of geometry, units, order and validity, and what is not used."""
-        return ()
-
-    @property
-    def used(self) -> tuple[Used, ...]:
-        """What the file states of each frame, and of exposure, current, energy and geometry, and what is used."""
-        return ()
-
-    @property
     def flags(self) -> FrameFlags | None:
         """Of the monitor, by frame; None where no monitor looked at the frames."""
-        return None
-
-    @property
-    def currents(self) -> NDArray[np.float64] | None:
-        """float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.
-
-        NaN where unknown; None where there is no monitor.
-        """
-        return None
-
-    @property
-    def energies(self) -> NDArray[np.float64] | None:
-        """float64 [frame] keV, NaN where unknown; None where the file states none of each frame."""
         return None
 
     @property
@@ -176,12 +166,7 @@ class ScanSource(ABC):
 
         NaN in other frames; None where it says nothing.
         """
-        return None
-
-    @property
-    def emission(self) -> EmissionOf | None:
-        """The counts of a sample that emits, whose line integrals the pixels are; None: it does not emit."""
-        return None
+        return self.stated_shifts
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
@@ -216,11 +201,6 @@ class ScanSource(ABC):
         Frames are compared only where half of them or more is read.
         """
         return frozenset()
-
-    @property
-    def plan(self) -> Mapping[str, Any]:
-        """The requested scan, as our files record it; empty if unknown."""
-        return {}
 
     @abstractmethod
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:

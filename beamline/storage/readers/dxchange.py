@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, Used, frame_indices
+from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource, TurnedFrames, dimensions
 from beamline.storage.readers.stated import (
@@ -22,8 +22,7 @@ from beamline.storage.readers.stated import (
     EXCHANGE_TIME_UNITS,
     in_use,
     not_copied,
-    not_used,
-    unknown_fields,
+    stated_in,
 )
 from drivers.base.frame import FrameKind
 
@@ -44,7 +43,7 @@ PLACES = (
 def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""
     file = hdf5.open_hdf5(path)
-    try:
+    with hdf5.closed_on_error(file):
         for _, where in PLACES:
             hdf5.refuse_broken(file, where)
         datasets = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
@@ -63,23 +62,17 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
-        source.stated = not_copied(file, TEXTS.values()) + not_used(EXCHANGE, file, source)
-        source.stated += unknown_fields(EXCHANGE, file, source)
-        source.in_use = in_use(EXCHANGE, file, source)
+        source.not_used = not_copied(file, TEXTS.values()) + stated_in(EXCHANGE, file, source)
+        source.used = in_use(EXCHANGE, file, source)
         _set_scale(source, file)
         if order is None and "axes" in file["exchange/data"].attrs:
-            source.stated += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
+            source.not_used += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
         return source
-    except BaseException:
-        file.close()
-        raise
 
 
 class ExchangeSource(StacksSource):
-    """A scan as Data Exchange; `stated` are the fields that are not used, `in_use` those that are."""
+    """A scan as Data Exchange."""
 
-    stated: tuple[NotUsed, ...] = ()
-    in_use: tuple[Used, ...] = ()
     _of_stack: NDArray[np.int64] | None = None
     """Rows of the stacks, one after the other, by the order of acquisition; None: the stacks' own order."""
 
@@ -106,14 +99,6 @@ class ExchangeSource(StacksSource):
         if self._of_stack is None:
             return super().read(frames, rows)
         return super().read(self._of_stack[frame_indices(frames, self.image_key.size)], rows)
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return self.stated
-
-    @property
-    def used(self) -> tuple[Used, ...]:
-        return self.in_use
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> list[NDArray[np.float64] | None]:
@@ -148,11 +133,8 @@ def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
 def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     """Positive times, one or so many; None where the file has no such, or in an unknown unit."""
     item = hdf5.dataset(file, where)
-    if item is None or item.size not in (1, n) or item.dtype.kind not in "uif":
-        return None
-    factor = EXCHANGE_TIME_UNITS.get(hdf5.attribute(item, "units").lower(), np.nan)
-    values = np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
-    return values if (values > 0).all() else None
+    values = None if item is None or item.size not in (1, n) else hdf5.in_units(item, EXCHANGE_TIME_UNITS)
+    return values if values is not None and (values > 0).all() else None
 
 
 def _words(item: h5py.Dataset) -> str:
@@ -184,7 +166,7 @@ def _in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset |
 
 
 def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
-    """Pixel size and energy; what the file says of them in a unit that cannot be joins `stated`."""
+    """Pixel size and energy; what the file says of them in a unit that cannot be joins `not_used`."""
     pixel = file.attrs.get("pixel_size_mm")
     source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
     energy = "measurement/instrument/monochromator/energy"
@@ -207,7 +189,7 @@ def _measured(
     if value is None or item is None or hdf5.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
     number = f"{np.ravel(hdf5.first_of(item))[0]:.6g}"
-    source.stated += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
+    source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
     return None
 
 

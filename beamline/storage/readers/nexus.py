@@ -144,38 +144,40 @@ def read_geometry(places: Places) -> NexusGeometry:
     Raises:
         DataError: distances that cannot be.
     """
-    detector, entry, remarks = places.detector, places.entry, dict[str, str]()
+    detector, entry = places.detector, places.entry
     own = [hdf5.scalar(detector, f"{side}_pixel_size", hdf5.LENGTH_UNITS) for side in "xy"]
     at_sample = [hdf5.scalar(entry, f"sample/{side}_pixel_size", hdf5.LENGTH_UNITS) for side in "xy"]
     pixels = [theirs or ours for theirs, ours in zip(at_sample, own, strict=True)]
-    cone = None
-    upstream, beyond = _source_distance(entry), hdf5.scalar(detector, "distance", hdf5.LENGTH_UNITS)
-    if upstream is not None and beyond is not None:
-        sod, sdd = abs(upstream), abs(upstream) + beyond
-        if not (sod > 0 and beyond >= 0):
-            raise DataError(
-                f"{entry.file.filename}: the source is {upstream:g} mm from the sample and the detector {beyond:g} mm "
-                "behind it; expected distances of the source that are not 0, and of the detector from 0 on. Correct "
-                "them in a copy of the file."
-            )
-        width = at_sample[0] or (None if own[0] is None else own[0] * sod / sdd)
-        field = None if width is None else width * places.data.shape[2] / 2
-        diverged = None if field is None else field / sod * places.data.shape[2] / 2
-        if sdd / sod > 1 + _MAGNIFIED or (diverged is not None and diverged > _DIVERGED):
-            cone = sod, sdd
-            pixels = [
-                theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)
-            ]  # on the detector
-        else:
-            by = "" if diverged is None else f", and rays leave their parallels by {diverged:.2g} px in the field"
-            remarks["source_distance"] = f"{sod:g} mm: a parallel beam (magnification {sdd / sod:.4f}{by})"
+    cone, remarks = _cone_of(places, own[0], at_sample[0])
+    if cone is not None:  # on the detector
+        sod, sdd = cone
+        pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
-    if any(mirrored):
-        how = " and ".join(
-            name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so
-        )
-        remarks["flipped"] = f"{how}: frames are mirrored back as they are read"
+    if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
+        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back as they are read"
     return NexusGeometry((pixels[0], pixels[1]), cone, mirrored, turned, remarks)
+
+
+def _cone_of(
+    places: Places, own: float | None, at_sample: float | None
+) -> tuple[tuple[float, float] | None, dict[str, str]]:
+    """The cone of `NexusGeometry`, and a remark on a beam that is as good as parallel; widths of a pixel in mm."""
+    upstream, beyond = _source_distance(places.entry), hdf5.scalar(places.detector, "distance", hdf5.LENGTH_UNITS)
+    if upstream is None or beyond is None:
+        return None, {}
+    sod, sdd = abs(upstream), abs(upstream) + beyond
+    if not (sod > 0 and beyond >= 0):
+        raise DataError(
+            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the detector {beyond:g} "
+            "mm behind it; expected distances of the source that are not 0, and of the detector from 0 on. Correct "
+            "them in a copy of the file."
+        )
+    width, cols = at_sample or (None if own is None else own * sod / sdd), places.data.shape[2]
+    diverged = None if width is None else width * cols / 2 / sod * cols / 2
+    if sdd / sod > 1 + _MAGNIFIED or (diverged is not None and diverged > _DIVERGED):
+        return (sod, sdd), {}
+    by = "" if diverged is None else f", and rays leave their parallels by {diverged:.2g} px in the field"
+    return None, {"source_distance": f"{sod:g} mm: a parallel beam (magnification {sdd / sod:.4f}{by})"}
 
 
 def differing(height: float | None, width: float | None) -> float | None:
@@ -219,13 +221,9 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
         for name, units, angstrom in ((energy, hdf5.ENERGY_UNITS, False), (wavelength, hdf5.WAVELENGTH_UNITS, True)):
             for where in groups_:
                 item = hdf5.dataset(entry, f"{where}/{name}")
-                factor = None if item is None else units.get(hdf5.attribute(item, "units").lower())
-                if item is None or factor is None or item.size != n or item.dtype.kind not in "uif":
-                    continue
-                values = np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
-                values = np.where(values > 0, values, np.nan)
-                if np.isfinite(values).any():
-                    return _HC / values if angstrom else values
+                values = None if item is None or item.size != n else hdf5.in_units(item, units)
+                if values is not None and (known := np.where(values > 0, values, np.nan))[np.isfinite(known)].size:
+                    return _HC / known if angstrom else known
     return None
 
 

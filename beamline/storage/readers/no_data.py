@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.storage.readers.base import WHOLE, Attributes, NotUsed, ScanSource, read_known
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, read_known
 from beamline.storage.readers.wrapped import UNPACKED, WrappedSource
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
@@ -27,7 +27,7 @@ class MarkedSource(WrappedSource):
     def __init__(self, base: ScanSource, no_data: Mask) -> None:
         super().__init__(base)
         self._no_data = no_data
-        self._update()
+        self.not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
         self.counter = not (base.image_key == FrameKind.DARK).any() and counts_photons(self)
         """It is one of photons, whose dark is 0 and absent."""
 
@@ -36,10 +36,6 @@ class MarkedSource(WrappedSource):
         of_darks = {"darks": "0, as flats vary as counted photons do"} if self.counter else {}
         marked = f"{self._no_data.mean():.2%}, filled from their neighbours"
         return {**self._base.attributes, "pixels_without_data": marked, **of_darks}
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return tuple(field for field in self._base.not_used if field.where != "detector/pixel_mask")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         pixels = self._base.read(frames, rows)

@@ -5,17 +5,18 @@ What counts is the structure, an NXdetector with `data` [frame, row, col] and `i
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
@@ -28,7 +29,6 @@ from beamline.storage.readers.base import (
     Quantity,
     ScanFormat,
     ScanSource,
-    Used,
     count_in_blocks,
     frame_indices,
     read_known,
@@ -43,12 +43,25 @@ from beamline.storage.readers.nexus import (
     read_geometry,
     require_order,
 )
-from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, not_used, unknown_fields
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, in_use, not_copied, stated_in
 from beamline.storage.writers import layout
 from beamline.storage.writers.ending import RUNNING, ScanEnding, ending_in
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import Mask
+
+_T = TypeVar("_T")
+
+
+def _guarded(method: Callable[[NXtomoSource], _T]) -> Callable[[NXtomoSource], _T]:
+    """The method, with h5py's errors as DataError."""
+
+    @wraps(method)
+    def guarded(self: NXtomoSource) -> _T:
+        with hdf5.readable(self.path):
+            return method(self)
+
+    return guarded
 
 
 class NXtomoSource(ScanSource):
@@ -61,7 +74,7 @@ class NXtomoSource(ScanSource):
         """
         self.path = path
         self._file = hdf5.open_hdf5(path, follow)
-        try:
+        with hdf5.closed_on_error(self._file):
             found = find(self._file)
             self._places = places = choose(self._file, found, data)
             self._ours = layout.COMMITTED in self._file
@@ -90,12 +103,15 @@ class NXtomoSource(ScanSource):
             self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
-            self._not_used = self._find_not_used(found if data is None else [])
-            self._used = self._find_used()
-            self._energies = None if self._ours else read_energies(places.entry, self.n)
-        except BaseException:
-            self._file.close()
-            raise
+            self.not_used = not_copied(places.entry, TEXTS.values())
+            if self._geometry is not None:
+                self._find_stated(found if data is None else [], self._geometry.turned)
+                self.energies, self.currents = read_energies(places.entry, self.n), self._currents()
+            else:
+                self.plan = json_object(hdf5.text_at(self._file, "/entry/record/plan")) or {}
+                devices = (self._file.get("/entry/instrument/devices") or {}).values()
+                periods = (float(device["row_period"][()]) for device in devices if "row_period" in device)
+                self.row_period = next(periods, None)
 
     def _cone(self) -> tuple[float, float] | None:
         sod = hdf5.scalar(self._file, layout.SOURCE_DISTANCE, hdf5.LENGTH_UNITS)
@@ -135,11 +151,8 @@ class NXtomoSource(ScanSource):
                 f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
             )
 
+    @_guarded
     def refresh(self) -> int:
-        with hdf5.readable(self.path):
-            return self._refreshed()
-
-    def _refreshed(self) -> int:
         places = self._places
         finer = hdf5.dataset(places.detector, "image_key_control")
         if self._ours:
@@ -181,21 +194,18 @@ class NXtomoSource(ScanSource):
         return hdf5.bytes_unpacked(self._places.data)
 
     @property
+    @_guarded
     def finished(self) -> bool:
         if not self._ours:
             return True
-        with hdf5.readable(self.path):
-            flag = self._file[layout.FINISHED]
-            hdf5.look_again(flag)
-            return bool(flag[()])
+        flag = self._file[layout.FINISHED]
+        hdf5.look_again(flag)
+        return bool(flag[()])
 
     @property
+    @_guarded
     def attributes(self) -> dict[str, str | float | int]:
         """What else the file says: sample, title, times, status, missing triggers, why it ended early."""
-        with hdf5.readable(self.path):
-            return self._facts()
-
-    def _facts(self) -> dict[str, str | float | int]:
         entry = self._places.entry
         facts: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
@@ -222,74 +232,49 @@ class NXtomoSource(ScanSource):
         return facts
 
     @property
+    @_guarded
     def ending(self) -> ScanEnding:
         if not self._ours:
             return ScanEnding()
-        with hdf5.readable(self.path):
-            ending = ending_in(self._file)
-            return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
+        ending = ending_in(self._file)
+        return replace(ending, missing=gaps_in(self.path, self._file)) if ending.status == RUNNING else ending
 
-    def _find_not_used(self, found: list[Places]) -> tuple[NotUsed, ...]:
-        outside = not_copied(self._places.entry, TEXTS.values())
-        if self._geometry is None:
-            return outside
-        detector = str(self._places.detector.name)
-        fields = outside + not_used(NXTOMO, self._places.entry, self, detector)
-        fields += unknown_fields(NXTOMO, self._places.entry, self, detector)
+    def _currents(self) -> NDArray[np.float64] | None:
+        item = hdf5.dataset(self._places.entry, "control/data")
+        if item is None or item.dtype.kind not in "uif" or item.size < self.n:
+            return None
+        values = np.ravel(hdf5.values_of(item))[: self.n].astype(np.float64)
+        return np.where(values > 0, values, np.nan)
+
+    def _find_stated(self, found: list[Places], turned: str) -> None:
+        """What a foreign file states: fields, other scans in it, and turns of the detector."""
+        self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
-            fields += (
-                NotUsed(where, f"{shape} frames", f"it is another scan of this file: --data-path {where}", True),
-            )
-        turned = self._geometry.turned
-        return (*fields, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else fields
-
-    def _find_used(self) -> tuple[Used, ...]:
-        if self._geometry is None:
-            return ()
-        return in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+            why = f"it is another scan of this file: --data-path {where}"
+            self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
+        self.used = in_use(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        if turned:
+            self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
 
     @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return self._not_used
-
-    @property
-    def used(self) -> tuple[Used, ...]:
-        return self._used
-
-    @property
-    def energies(self) -> NDArray[np.float64] | None:
-        return self._energies
-
-    @property
+    @_guarded
     def flags(self) -> FrameFlags | None:
-        with hdf5.readable(self.path):
-            flags = read_flags(self._file, self.n) if self._ours else None
+        flags = read_flags(self._file, self.n) if self._ours else None
         return flags if flags is not None and (self.plan or flags.flagged.any()) else None  # a copy has none to say
 
     @property
-    def currents(self) -> NDArray[np.float64] | None:
-        item = None if self._ours else hdf5.dataset(self._places.entry, "control/data")
-        if item is None or item.dtype.kind not in "uif" or item.size < self.n:
-            return None
-        with hdf5.readable(self.path):
-            values = np.ravel(hdf5.values_of(item))[: self.n].astype(np.float64)
-        return np.where(values > 0, values, np.nan)
-
-    @property
+    @_guarded
     def times(self) -> NDArray[np.float64] | None:
-        with hdf5.readable(self.path):
-            seconds = self._seconds(self._places.entry, "frame_log/time")
+        seconds = self._seconds(self._places.entry, "frame_log/time")
         seconds[[*self._altered]] = np.nan
         return seconds if np.isfinite(seconds).any() else None
 
     @property
+    @_guarded
     def replaces(self) -> NDArray[np.int64] | None:
-        with hdf5.readable(self.path):
-            if not self._ours:
-                return None
-            rows = self._replaces()
-            return rows if (rows >= 0).any() else None
+        rows = self._replaces() if self._ours else np.empty(0, np.int64)
+        return rows if (rows >= 0).any() else None
 
     def _replaces(self) -> NDArray[np.int64]:
         rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n].astype(np.int64)
@@ -298,10 +283,10 @@ class NXtomoSource(ScanSource):
         return rows
 
     @property
+    @_guarded
     def part_starts(self) -> NDArray[np.int64]:
-        with hdf5.readable(self.path):
-            item = hdf5.dataset(self._file, layout.PART_STARTS) if self._ours else None
-            starts = np.zeros(1, np.int64) if item is None else np.ravel(hdf5.values_of(item))
+        item = hdf5.dataset(self._file, layout.PART_STARTS) if self._ours else None
+        starts = np.zeros(1, np.int64) if item is None else np.ravel(hdf5.values_of(item))
         if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
             raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
         return starts.astype(np.int64)
@@ -353,21 +338,6 @@ class NXtomoSource(ScanSource):
     def altered(self) -> frozenset[int]:
         return frozenset(self._altered)
 
-    @property
-    def row_period(self) -> float | None:
-        devices = self._file.get("/entry/instrument/devices") if self._ours else None
-        with hdf5.readable(self.path):
-            periods = [device["row_period"] for device in (devices or {}).values() if "row_period" in device]
-            return float(periods[0][()]) if periods else None
-
-    @property
-    def plan(self) -> Mapping[str, Any]:
-        try:
-            plan = json.loads(hdf5.text_at(self._file, "/entry/record/plan") or "{}") if self._ours else {}
-        except (ValueError, RecursionError):
-            return {}
-        return plan if isinstance(plan, dict) else {}
-
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """The frames from `first` on, with all that the file knows about each."""
         self.require_counts()
@@ -402,16 +372,14 @@ class NXtomoSource(ScanSource):
         return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
+        """Seconds of each frame; NaN where the file states none."""
         item = hdf5.dataset(group, path)
-        factor = None if item is None else hdf5.TIME_UNITS.get(hdf5.attribute(item, "units").lower())
-        if item is None or factor is None or item.dtype.kind not in "uif":
-            return np.full(self.n, np.nan)
-        if self._ours:
+        if item is not None and self._ours:
             hdf5.look_again(item)
-        values = np.ravel(hdf5.values_of(item)).astype(np.float64) * factor
-        if values.size == 1:
-            return np.full(self.n, values[0])
-        return values[: self.n] if values.size >= self.n else np.full(self.n, np.nan)
+        values = hdf5.in_units(item, hdf5.TIME_UNITS)
+        if values is None or 1 != values.size < self.n:
+            return np.full(self.n, np.nan)
+        return np.full(self.n, values[0]) if values.size == 1 else values[: self.n]
 
     def close(self) -> None:
         self._file.close()

@@ -15,16 +15,14 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
-from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
+from beamline.storage.readers.changed import AveragedSource, OverlaidSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import MarkedSource, no_data_of
 from beamline.storage.readers.nxtomo import NXtomoSource
-from beamline.storage.readers.overlay import OverlaidSource
-from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.side_files import SidedSource, SideFile, read_side_file, side_of
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
+from beamline.storage.readers.supplied import Angles, Images, load_angles, load_images, parse_angles, select_rows
 from beamline.storage.readers.wrapped import (
     UNPACKED,
     CroppedSource,
@@ -172,18 +170,14 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
 
 def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     """The scan with what the caller says instead of its files."""
-    darks, flats, quantity = options.darks, options.flats, options.quantity
+    quantity = options.quantity
     side = None if options.side_file is None else read_side_file(options.side_file)
     if side is not None:
         base = SidedSource(base, side)
     angle_table, angles_from = _angle_table(options, base, side)
     if base.dtype.str[1:] in _SIGNED and (dtype := _unsigned_type(base)) is not None:
         base = UnsignedSource(base, dtype)
-    if quantity == "transmission":
-        darks, flats = _beam_of_one(base, options)
-    elif side is not None and side.white is not None and base.dtype.kind in "ui":
-        flats = np.full((1, *base.shape), side.white, base.dtype) if flats is None else flats
-        darks = np.zeros((1, *base.shape), base.dtype) if darks is None else darks
+    darks, flats = _references(base, options, None if side is None else side.white)
     if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
         base = marked = MarkedSource(base, no_data)
         darks = np.zeros((1, *base.shape), base.dtype) if darks is None and marked.counter else darks
@@ -238,8 +232,21 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     return open_stacks(path, data, options.darks_path, options.flats_path)
 
 
-def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The darks and flats by which transmission was divided already: of 0 and 1. DataError for what is none."""
+def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:
+    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
+
+    Args:
+        white: counts of the open beam by the maker's file.
+
+    Raises:
+        DataError: what is no transmission.
+    """
+    nothing = np.zeros((1, *base.shape), base.dtype)
+    if options.quantity != "transmission":
+        if white is None or base.dtype.kind not in "ui":
+            return options.darks, options.flats
+        flats = np.full_like(nothing, white) if options.flats is None else options.flats
+        return nothing if options.darks is None else options.darks, flats
     if options.darks is not None or options.flats is not None:
         raise DataError("--quantity transmission is of frames divided by their flats: leave out --darks and --flats.")
     if base.dtype.kind != "f":
@@ -247,7 +254,7 @@ def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any]
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
             "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
         )
-    return np.zeros((1, *base.shape), base.dtype), np.ones((1, *base.shape), base.dtype)
+    return nothing, np.ones_like(nothing)
 
 
 def _unsigned_type(source: ScanSource) -> np.dtype[Any] | None:

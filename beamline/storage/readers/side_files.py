@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -129,18 +130,11 @@ class SidedSource(WrappedSource):
             raise DataError(f"{side.path} is of {side.count} projections; {base.path} holds {views}.")
         self.cone, self.pixel_size_mm, self.row_pitch_mm = side.cone, side.pixel_mm, None
         self._side = side
-        self._update()
+        self.not_used = tuple(field for field in base.not_used if field.where != side.path.name)
 
     @property
     def attributes(self) -> Mapping[str, str | float | int]:
         return {**self._base.attributes, "from": f"{self._side.path.name}, {self._side}"}
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return tuple(field for field in self._base.not_used if field.where != self._side.path.name)
-
-    def read(self, frames: Any, rows: slice = slice(None)) -> NDArray[Any]:
-        return self._base.read(frames, rows)
 
 
 def read_side_file(path: Path) -> SideFile:
@@ -230,14 +224,17 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
             values[f"{path}{key.lower()}"] = str(value)
 
 
-def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
-    def number(key: str) -> float | None:
-        match = re.match(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?", values.get(key, "")) if key else None
-        try:
-            return None if match is None else float(match[0])
-        except ValueError:
-            return None
+def _number(values: Mapping[str, str], key: str) -> float | None:
+    """The number that a text begins with; None where there is none."""
+    match = re.match(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?", values.get(key, "")) if key else None
+    try:
+        return None if match is None else float(match[0])
+    except ValueError:
+        return None
 
+
+def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
+    number = partial(_number, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
         raise DataError(f"{path} says {other}: its scan is not on a circle, which is not read.")
     scale = (number(keys.scale) or 1.0) if keys.scale else 1.0
@@ -246,11 +243,13 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
     sod, sdd, pixel, count = (float(value or 0) for value in given.values())
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
-    step, span, n = number(keys.step), number(keys.span) or _ROUND.get(keys.maker), int(count)
-    step = step if step is not None or span is None else span / n
-    listed = _listed_angles(path, n) if keys.maker == "Nikon" else None
-    angles = None if step is None else (number(keys.first) or 0.0) + step * np.arange(n)
-    angles = angles if listed is None else listed
+    n, span = int(count), number(keys.span) or _ROUND.get(keys.maker)
+    step = number(keys.step)
+    if step is None and span is not None:
+        step = span / n
+    angles = _listed_angles(path, n) if keys.maker == "Nikon" else None
+    if angles is None and step is not None:
+        angles = (number(keys.first) or 0.0) + step * np.arange(n, dtype=np.float64)
     radians = None if angles is None else np.radians(angles)
     return SideFile(path, keys.maker, (sod * scale, sdd * scale), pixel, n, radians, number(keys.white))
 

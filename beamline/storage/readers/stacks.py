@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import h5py
 import numpy as np
@@ -71,22 +71,17 @@ class FrameStack:
     frames: Any
 
 
-class Closable(Protocol):
-    """An object that is closed with the scan."""
-
-    def close(self) -> None: ...
-
-
 class StacksSource(ScanSource):
     """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
 
     Quantity: "counts" if there are darks and flats, otherwise "unknown".
     """
 
-    def __init__(
-        self, path: Path, file: Closable, stacks: Sequence[FrameStack], *, format: str, facts: Attributes
-    ) -> None:
-        """Take over an open file. Angles are NaN; `stacks` are in the order of the frames, the projections last."""
+    def __init__(self, path: Path, file: Any, stacks: Sequence[FrameStack], *, format: str, facts: Attributes) -> None:
+        """Take over an open file, or what else is closed with the scan.
+
+        Angles are NaN; `stacks` are in the order of the frames, the projections last.
+        """
         self.path, self.format, self.facts = path, format, facts
         self._file, self._stacks = file, stacks
         self._check()
@@ -146,7 +141,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
     DataError where one is not there, or is no stack of frames; the message names the datasets that the file has.
     """
     file = hdf5.open_hdf5(path)
-    try:
+    with hdf5.closed_on_error(file):
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats), (FrameKind.PROJECTION, data))
         stacks = []
         for kind, where in given:
@@ -155,9 +150,6 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
                 image = item.ndim == 2 and kind != FrameKind.PROJECTION
                 stacks.append(FrameStack(kind, where, item[()][None] if image else item))
         return StacksSource(path, file, stacks, format="hdf5_stacks", facts={"data": data})
-    except BaseException:
-        file.close()
-        raise
 
 
 def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
@@ -173,13 +165,11 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
-        hdf5.require_real(item.dtype, f"{where} in {path}")
-        stated_unit = unit or hdf5.attribute(item, "units")
-        factor = hdf5.ANGLE_UNITS.get(stated_unit.lower())
-        if factor is None:
-            problem = f"the units {stated_unit!r}" if stated_unit else "no attribute `units`"
+        stated = unit or hdf5.attribute(item, "units")
+        if stated.lower() not in hdf5.ANGLE_UNITS:
+            problem = f"the units {stated!r}" if stated else "no attribute `units`"
             raise DataError(f"{where} in {path} has {problem}: say --angles-unit deg or --angles-unit rad.")
-        return np.ravel(np.asarray(hdf5.values_of(item), np.float64)) * factor
+        return hdf5.radians(item, unit)
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:

@@ -1,6 +1,6 @@
 """Fields of foreign files that bear on geometry, units, order and validity, and what we do with each.
 
-`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `not_used` for those that its file states
+`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `stated_in` for those that a file states
 and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
 """
 
@@ -57,11 +57,15 @@ class Entry:
     units: Mapping[str, float] | None = None
 
 
-def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
+def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
     """The fields that a file states and that are not used; a value that may change the volume is a doubt.
 
-    Numbers that would be used, were their unit known, are among them.
+    Numbers that would be used, were their unit known, are among them, and fields whose names are not known.
     """
+    return (*_not_used(fields, root, source, detector), *_unknown_fields(fields, root, source, detector))
+
+
+def _not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
     unused = []
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
@@ -80,7 +84,7 @@ def not_used(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, dete
         elif value.size not in (1, source.image_key.size, (source.image_key == FrameKind.PROJECTION).sum()):
             why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
             unused.append(NotUsed(field.where, _text(value, unit), why, True))
-    return tuple(unused)
+    return unused
 
 
 def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[Used, ...]:
@@ -94,9 +98,7 @@ def in_use(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detect
     return tuple(used)
 
 
-def unknown_fields(
-    fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str = ""
-) -> tuple[NotUsed, ...]:
+def _unknown_fields(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, detector: str) -> list[NotUsed]:
     """What a file states of each frame, and of exposure, current, energy, position and temperature, under other names.
 
     A doubt where what may change line integrals differs from view to view.
@@ -118,7 +120,7 @@ def unknown_fields(
             unknown.append(NotUsed(name, _text(value, hdf5.attribute(item, "units")), _UNKNOWN, doubt))
 
     root.visititems(visit)
-    return tuple(unknown[:_MOST])
+    return unknown[:_MOST]
 
 
 def _place(item: h5py.Dataset) -> tuple[int, int]:

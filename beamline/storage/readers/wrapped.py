@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,24 +17,34 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, LookedEnoughError, ScanSource, frame_indices
 from drivers.base.frame import Frame, FrameKind
 
+_T = TypeVar("_T")
 UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read at once, to describe a scan
 
 
+_BY_FRAME = ("currents", "energies", "times", "shifts")
+_OWN = {"facts", "unreadable", "stated_shifts", "stated_ending", *_BY_FRAME}
+_COPIED = [name for name in ScanSource.__annotations__ if name not in _OWN]
+
+
 class WrappedSource(ScanSource):
-    """All of `base`. A subclass has `read` and what differs; its `_update` sets `image_key`, `angles`, `exposures`."""
+    """All of `base`. A subclass has what differs; its `_update` sets `image_key`, `angles`, `exposures`."""
 
     def __init__(self, base: ScanSource) -> None:
         self._base = base
-        self.path, self.format, self.shape, self.dtype = base.path, base.format, base.shape, base.dtype
-        self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
-        self.cone, self.axis_col, self.row_pitch_mm = base.cone, base.axis_col, base.row_pitch_mm
-        self.in_order, self.numbers, self.frames_per_view = base.in_order, base.numbers, base.frames_per_view
-        self.pixel_mask = base.pixel_mask
+        for name in _COPIED:
+            setattr(self, name, getattr(base, name))
 
     def _update(self) -> None:
         """Take over the present frames of `base`."""
         base = self._base
         self.image_key, self.angles, self.exposures = base.image_key, base.angles, base.exposures
+
+    def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Values [frame, ...] of `base` for the frames of this scan; None: not told."""
+        return known
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return self._base.read(frames, rows)
 
     def refresh(self) -> int:
         self._base.refresh()
@@ -51,9 +61,21 @@ class WrappedSource(ScanSource):
         self._base.close()
 
 
+def _of_frames(name: str) -> Callable[[WrappedSource], NDArray[np.float64] | None]:
+    """A property of the frames of `base`, for those of a scan that wraps it."""
+
+    def known(self: WrappedSource) -> NDArray[np.float64] | None:
+        values = getattr(self._base, name)
+        return None if values is None else self.of_frames(values)
+
+    return known
+
+
 for _name, _value in vars(ScanSource).items():  # all that may change, also what is added to it
     if isinstance(_value, property):
         setattr(WrappedSource, _name, property(attrgetter(f"_base.{_name}")))
+for _name in _BY_FRAME:
+    setattr(WrappedSource, _name, property(_of_frames(_name)))
 
 
 class BriefSource(WrappedSource):
@@ -64,7 +86,6 @@ class BriefSource(WrappedSource):
     def __init__(self, base: ScanSource, over: Callable[[], bool]) -> None:
         super().__init__(base)
         self._over = over
-        self._update()
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         n = frame_indices(frames, int(self.image_key.size)).size * len(range(self.shape[0])[rows])
@@ -73,7 +94,7 @@ class BriefSource(WrappedSource):
                 "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
                 "validate` looks at them."
             )
-        return self._base.read(frames, rows)
+        return super().read(frames, rows)
 
 
 class CroppedSource(WrappedSource):
@@ -91,12 +112,7 @@ class CroppedSource(WrappedSource):
         super().__init__(base)
         self.cols, self.shape = cols, (base.shape[0], end - first)
         self.axis_col = None if base.axis_col is None else base.axis_col - first
-        self._update()
-
-    @property
-    def _cols(self) -> slice:
-        assert self.cols is not None
-        return slice(*self.cols)
+        self._cols = slice(first, end)
 
     @property
     def flags(self) -> FrameFlags | None:
@@ -128,7 +144,6 @@ class TurnedSource(WrappedSource):
         self.shape, self.axis_col = (base.shape[1], base.shape[0]), None
         if base.row_pitch_mm is not None:
             self.pixel_size_mm, self.row_pitch_mm = base.row_pitch_mm, base.pixel_size_mm
-        self._update()
 
     @property
     def shifts(self) -> NDArray[np.float64] | None:
@@ -171,9 +186,6 @@ class KeyedSource(WrappedSource):
     def _update(self) -> None:
         super()._update()
         self.image_key = self._keys
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        return self._base.read(frames, rows)
 
 
 def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
@@ -246,7 +258,6 @@ class UnsignedSource(WrappedSource):
     def __init__(self, base: ScanSource, dtype: np.dtype[Any]) -> None:
         super().__init__(base)
         self.dtype = dtype
-        self._update()
 
     @property
     def attributes(self) -> Attributes:
@@ -312,11 +323,12 @@ class PartsSource(WrappedSource):
         self._update()
 
     def _update(self) -> None:
-        sources = self._sources
-        self._firsts = np.cumsum([0, *(source.image_key.size for source in sources)])
-        self.image_key = np.concatenate([source.image_key for source in sources])
-        self.angles = np.concatenate([source.angles for source in sources])
-        self.exposures = np.concatenate([source.exposures for source in sources])
+        self._firsts = np.cumsum([0, *(source.image_key.size for source in self._sources)])
+        for name in ("image_key", "angles", "exposures"):
+            setattr(self, name, np.concatenate([getattr(source, name) for source in self._sources]))
+
+    def of_frames(self, known: NDArray[np.float64]) -> None:
+        return None
 
     @property
     def flags(self) -> FrameFlags | None:
@@ -329,21 +341,18 @@ class PartsSource(WrappedSource):
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
-        if all(source.replaces is None for source in self._sources):
+        known = [source.replaces for source in self._sources]
+        if all(rows is None for rows in known):
             return None
-        rows = []
-        for source, first in zip(self._sources, self._firsts[:-1], strict=True):
-            known = np.full(source.image_key.size, -1) if source.replaces is None else source.replaces
-            rows.append(np.where(known < 0, -1, known + first))
-        return np.concatenate(rows)
+        none = (np.full(source.image_key.size, -1) for source in self._sources)
+        filled = [own if rows is None else rows for own, rows in zip(none, known, strict=True)]
+        return np.concatenate([np.where(rows < 0, -1, rows + first) for first, rows in self._each(filled)])
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
         if self._one:
             return np.zeros(1, np.int64)
-        return np.concatenate(
-            [s.part_starts + first for s, first in zip(self._sources, self._firsts[:-1], strict=True)]
-        )
+        return np.concatenate([rows + first for first, rows in self._each(s.part_starts for s in self._sources)])
 
     @property
     def checksummed(self) -> bool:
@@ -351,15 +360,17 @@ class PartsSource(WrappedSource):
 
     @property
     def altered(self) -> frozenset[int]:
-        pairs = zip(self._sources, self._firsts[:-1], strict=True)
-        return frozenset(int(row + first) for source, first in pairs for row in source.altered)
+        each = self._each(source.altered for source in self._sources)
+        return frozenset(int(row + first) for first, rows in each for row in rows)
 
     @property
     def damaged(self) -> frozenset[int]:
-        pairs = zip(self._sources, self._firsts[:-1], strict=True)
-        return frozenset(int(row + first) for source, first in pairs for row in source.damaged)
+        each = self._each(source.damaged for source in self._sources)
+        return frozenset(int(row + first) for first, rows in each for row in rows)
 
-    currents, energies, shifts = ScanSource.currents, ScanSource.energies, ScanSource.shifts  # not told of parts
+    def _each(self, of_sources: Iterable[_T]) -> Iterator[tuple[int, _T]]:
+        """With the first row of each file."""
+        return zip(self._firsts[:-1], of_sources, strict=True)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

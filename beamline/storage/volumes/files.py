@@ -20,9 +20,8 @@ from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
-from beamline.storage.volumes.nxtomoproc import NexusVolume, NXtomoproc
-from beamline.storage.volumes.plain import Npy
 from beamline.storage.volumes.registry import formats
+from beamline.storage.volumes.single_files import NexusVolume, Npy, NXtomoproc
 from beamline.storage.writers.recon_file import (
     SUFFIXES,
     opened_reconstruction,

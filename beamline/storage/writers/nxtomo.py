@@ -24,6 +24,7 @@ from beamline.monitor.check import Flag
 from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
+from beamline.storage.disk_file import ToDisk
 from beamline.storage.flag_legend import mark_of, place_of
 from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
@@ -32,7 +33,6 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.ending import STATUSES, ScanEnding, state_ending, state_words, with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.rows import Record, Rows
-from beamline.storage.writers.to_disk import ToDisk
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame
 from drivers.base.protocols import BeamReading

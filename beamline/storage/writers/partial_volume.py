@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, refuse_existing, replaceable, whole_file
 from beamline.storage import hdf5
+from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
-from beamline.storage.scratch import reserve
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
 from beamline.storage.writers.recon_file import SUFFIXES, rewrite_facts, value_of, write_record
 from recon.base.volume import Slab

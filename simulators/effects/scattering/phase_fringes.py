@@ -13,9 +13,8 @@ from scipy import fft
 
 from recon.base.jit import njit, thread_count
 from simulators.effects.chain import ImageEffect
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import NotNegative, Positive
-from simulators.frame.shot import CannotExposeError, Image, Shot
+from simulators.frame.shot import CannotExposeError, Detector, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged
 

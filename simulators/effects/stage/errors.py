@@ -13,8 +13,7 @@ from pydantic import AfterValidator
 
 from simulators.effects.chain import Anomaly, Label, PoseEffect
 from simulators.frame.mapping import NotNegative, Positive, Whole
-from simulators.frame.pose import Pose
-from simulators.frame.shot import AngleAt, Shot, frame_rng
+from simulators.frame.shot import AngleAt, Pose, Shot, frame_rng
 
 Wave = tuple[int, NotNegative, float]
 """Waves a turn, amplitude (its unit is the effect's) and phase in degrees; 0 waves are a constant."""

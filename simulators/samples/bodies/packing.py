@@ -9,9 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
-from simulators.frame.shot import CannotExposeError
+from simulators.frame.shot import CannotExposeError, Detector, Pose
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid, Quaternion, Solid
 
 Reals = NDArray[np.float64]

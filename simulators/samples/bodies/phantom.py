@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.jit import njit
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.samples.bodies.chords import depths
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack, view_of
 from simulators.samples.bodies.solids import Solid, kind_of
@@ -36,19 +35,16 @@ def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, 
     """
     far = 0.5 * math.sqrt(edges[0] ** 2 + edges[1] ** 2 + edges[2] ** 2)
     for b in range(p.kind.size):
-        k0, k1, j0, j1 = _box(p, b, corner, edges, out.shape)
-        left = corner[2] - p.centre[b, 0]
+        k0, k1, j0, j1, i0, i1 = _box(p, b, corner, edges, out.shape)
         for k in range(k0, k1):
             z = corner[0] + k * edges[0] - p.centre[b, 2]
             for j in range(j0, j1):
                 y = corner[1] + j * edges[1] - p.centre[b, 1]
-                first, stop = _line(p, b, y, z, far, left, edges[2], out.shape[2])
-                full, over = _line(p, b, y, z, -far, left, edges[2], out.shape[2])
-                for i in range(first, stop):
-                    if full <= i < over:
-                        out[k, j, i] += p.attenuation[b]
-                    else:
-                        share = _filled(p, b, left + i * edges[2], y, z, edges, supersample)
+                for i in range(i0, i1):
+                    x = corner[2] - p.centre[b, 0] + i * edges[2]
+                    level = _level(p, b, x, y, z)
+                    if level <= far:
+                        share = 1.0 if level <= -far else _filled(p, b, x, y, z, edges, supersample)
                         out[k, j, i] += p.attenuation[b] * share
 
 
@@ -59,58 +55,14 @@ def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Tripl
     `out` is uint8 [z, y, x]; corner and edges as for add_attenuation.
     """
     for b in range(p.kind.size):
-        k0, k1, j0, j1 = _box(p, b, corner, edges, out.shape)
-        left = corner[2] - p.centre[b, 0]
+        k0, k1, j0, j1, i0, i1 = _box(p, b, corner, edges, out.shape)
         for k in range(k0, k1):
             z = corner[0] + k * edges[0] - p.centre[b, 2]
             for j in range(j0, j1):
                 y = corner[1] + j * edges[1] - p.centre[b, 1]
-                first, stop = _line(p, b, y, z, 0.0, left, edges[2], out.shape[2])
-                out[k, j, first:stop] = label[b]
-
-
-@njit(**_KERNEL)
-def _line(p: Packed, b: int, y: float, z: float, limit: float, left: float, edge: float, n: int) -> tuple[int, int]:
-    """Range of voxels of a line along x whose centres have a level <= limit; contiguous, since bodies are convex. In
-    closed form, then corrected by the level itself at both ends."""
-    low, high = -np.inf, np.inf
-    if p.kind[b] == CYLINDER:
-        radius = p.size[b, 0] + limit
-        square = radius * radius - y * y
-        if abs(z) > p.size[b, 1] + limit or radius < 0.0 or square < 0.0:
-            return 0, 0
-        low, high = -math.sqrt(square), math.sqrt(square)
-    elif p.kind[b] == ELLIPSOID:
-        W, radius = p.matrix[b], 1.0 + limit / p.size[b, 0]
-        aa = ad = dd = 0.0
-        for k in range(3):
-            a, d = W[k, 1] * y + W[k, 2] * z, W[k, 0]
-            aa, ad, dd = aa + a * a, ad + a * d, dd + d * d
-        square = ad * ad - dd * (aa - radius * radius)
-        if radius < 0.0 or square < 0.0:
-            return 0, 0
-        low, high = (-ad - math.sqrt(square)) / dd, (-ad + math.sqrt(square)) / dd
-    else:
-        for f in range(p.first_face[b], p.first_face[b + 1]):
-            slope = p.faces[f, 0]
-            rest = p.faces[f, 3] + limit - p.faces[f, 1] * y - p.faces[f, 2] * z
-            if slope > 0.0:
-                high = min(high, rest / slope)
-            elif slope < 0.0:
-                low = max(low, rest / slope)
-            elif rest < 0.0:
-                return 0, 0
-    first = math.ceil(min(max((low - left) / edge, 0.0), float(n)))
-    stop = math.floor(min(max((high - left) / edge, -1.0), n - 1.0)) + 1
-    while first > 0 and _level(p, b, left + (first - 1) * edge, y, z) <= limit:
-        first -= 1
-    while stop < n and _level(p, b, left + stop * edge, y, z) <= limit:
-        stop += 1
-    while first < stop and _level(p, b, left + first * edge, y, z) > limit:
-        first += 1
-    while first < stop and _level(p, b, left + (stop - 1) * edge, y, z) > limit:
-        stop -= 1
-    return first, max(first, stop)
+                for i in range(i0, i1):
+                    if _level(p, b, corner[2] - p.centre[b, 0] + i * edges[2], y, z) <= 0.0:
+                        out[k, j, i] = label[b]
 
 
 @njit(**_KERNEL)
@@ -145,11 +97,14 @@ def _filled(p: Packed, b: int, x: float, y: float, z: float, edges: Triple, n: i
 
 
 @njit(**_KERNEL)
-def _box(p: Packed, b: int, corner: Triple, edges: Triple, shape: tuple[int, int, int]) -> tuple[int, int, int, int]:
-    """Ranges of voxels along z and y that touch the box around the body."""
+def _box(
+    p: Packed, b: int, corner: Triple, edges: Triple, shape: tuple[int, int, int]
+) -> tuple[int, int, int, int, int, int]:
+    """Ranges of voxels along z, y and x that touch the box around the body."""
     k0, k1 = _voxels(corner[0] - p.centre[b, 2], edges[0], p.extent[b, 2], shape[0])
     j0, j1 = _voxels(corner[1] - p.centre[b, 1], edges[1], p.extent[b, 1], shape[1])
-    return k0, k1, j0, j1
+    i0, i1 = _voxels(corner[2] - p.centre[b, 0], edges[2], p.extent[b, 0], shape[2])
+    return k0, k1, j0, j1, i0, i1
 
 
 @njit(**_KERNEL)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -78,33 +79,29 @@ def _grey(where: str, entry: Any) -> tuple[Solid, str]:
         return solid, name or kind_of(solid)
 
 
-def _read(name: str, module: str) -> _Builder:
-    """The builder of a phantom that is read from a file: `sample_of` of the module, by its settings."""
-
-    def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-        found = import_module(module)
-        settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
-        if read is None:
-            raise ValueError(f"{settings.file} cannot be read: no reader of such files was given")
-        phantom: Sample = found.sample_of(settings, read)
-        return phantom
-
+def _read(
+    name: str, module: str, where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None
+) -> Sample:
+    """A phantom that is read from a file, such as by `volume_sample` of VolumeSettings in the module."""
+    found = import_module(module)
+    settings = build(getattr(found, f"{name.title()}Settings"), where, mapping)
+    if read is None:
+        raise ValueError(f"{settings.file} cannot be read: no reader of such files was given")
+    sample: Sample = getattr(found, f"{name}_sample")(settings, read)
     return sample
 
 
-def _built(name: str, module: str) -> _Builder:
-    """The builder of a phantom out of pieces: `phantom` of the module."""
-
-    def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-        phantom: Sample = import_module(module).phantom(name, where, mapping, beam)
-        return phantom
-
+def _built(
+    name: str, module: str, where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None
+) -> Sample:
+    """A phantom out of pieces, by `phantom` of the module."""
+    sample: Sample = import_module(module).phantom(name, where, mapping, beam)
     return sample
 
 
 _KINDS: Mapping[str, _Builder] = {
     "battery": _battery,
     "solids": _solids,
-    **{name: _built(name, module) for name, module in in_folders("simulators.samples.builders", "PHANTOMS").items()},
-    **{name: _read(name, module) for name, module in in_folders("simulators.samples", "PHANTOMS").items()},
+    **{name: partial(_built, name, at) for name, at in in_folders("simulators.samples.builders", "PHANTOMS").items()},
+    **{name: partial(_read, name, at) for name, at in in_folders("simulators.samples", "PHANTOMS").items()},
 }

@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError, choose, located
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.light.beam import Beam
 from simulators.pixels.bands import share_rows
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import SOLIDS, Solid, kind_of
-from simulators.samples.materials.materials import Material
-from simulators.samples.materials.palette import Palette, palette_of
+from simulators.samples.materials.materials import Material, Palette, palette_of
 from simulators.samples.materials.spectrum import Attenuation, Spectrum, light
 from simulators.samples.sample import Sample
 

@@ -2,4 +2,4 @@
 
 from __future__ import annotations
 
-PHANTOMS = {name: f"{__name__}.{name}" for name in ("volume", "mesh")}
+PHANTOMS = dict.fromkeys(("volume", "mesh"), f"{__name__}.files")

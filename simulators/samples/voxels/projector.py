@@ -9,15 +9,14 @@ beam through an upright sample each row lies in one slice, with one interpolatio
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.jit import njit, thread_count
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from recon.base.jit import njit
+from simulators.frame.shot import Detector, Pose
+from simulators.pixels.bands import share_rows
 
 Reals = NDArray[np.float64]
 Voxels32 = NDArray[np.float32]
@@ -72,15 +71,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
         def rows(low: int, high: int) -> None:
             _any(lattice, rays, axes, origin, low, high, out)
 
-    # Not numba's get_num_threads, which starts numba's own threads and slows torch down.
-    threads = min(thread_count(), detector.shape[0])
-    if threads == 1:
-        rows(0, detector.shape[0])
-        return out
-    # More jobs than threads, since rows near the middle cost more than those beside the sample.
-    cuts = np.linspace(0, detector.shape[0], min(8 * threads, detector.shape[0]) + 1).astype(int).tolist()
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(rows, cuts[:-1], cuts[1:]))
+    share_rows(rows, detector.shape, bands=8)  # rows near the middle cost more than those beside the sample
     return out
 
 

@@ -14,9 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
-from simulators.frame.shot import CannotExposeError
+from simulators.frame.shot import CannotExposeError, Detector, Pose
 from simulators.samples.bodies.solids import LEAST, MOST
 from simulators.samples.voxels.projector import padded, project
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, build
+from simulators.frame.shot import Detector
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder

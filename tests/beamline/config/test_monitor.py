@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError
 from beamline.monitor.beam import BeamCheck
 from beamline.monitor.check import Policy
 from beamline.monitor.checks import CHECKS
-from beamline.monitor.mass import MassCheck
+from beamline.monitor.field import MassCheck
 
 
 @pytest.mark.parametrize("name", ["demo", "simulated", "instrument"])

@@ -20,7 +20,7 @@ from drivers.base.protocols import TriggerSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from simulators.devices.clock import ScaledClock, VirtualClock
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.scenes.scene import load_scene
 from tests.beamline.ball_scan import BALL, COMMON, STAGES, fly, shipped, small
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +102,10 @@ class FakeScan:
             state, found = scan.look(state, frame, digest(frame.counts, SATURATION, 4))
             flags += found
         return flags
+
+    def of(self, check: str, frames: Iterable[Frame], **options: Any) -> list[Flag]:
+        """Those of one check."""
+        return [flag for flag in self.flags(frames, **options) if flag.check == check]
 
 
 @pytest.fixture

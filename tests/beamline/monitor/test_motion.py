@@ -1,4 +1,4 @@
-"""A jump of the sample is flagged in the view in which it happens, with its size and direction."""
+"""A jump is flagged in the view in which it happens, a shake by its size across and down; nothing else is either."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
 from tests.beamline.monitor.foreign.test_ghost import fog
+from tests.slow_cases import others_slow
 
 
-def only(scan: Blobs) -> list[Flag]:
+def of_motion(scan: Blobs) -> list[Flag]:
     return scan.flags([MotionCheck()])
 
 
@@ -27,7 +29,7 @@ def jumping(down: float, across: float, slip: int = 0) -> Blobs:
 
 @pytest.mark.parametrize(("down", "across"), [(1.0, 0.0), (0.0, -1.0), (-3.0, 2.0)])
 def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> None:
-    flags = only(jumping(down, across))
+    flags = of_motion(jumping(down, across))
     assert [(flag.frame, flag.level) for flag in flags] == [(50, Level.ALARM)]
     assert flags[0].score == pytest.approx(np.hypot(down, across), rel=0.15)
     signs = re.search(r"by ([+-]).* px across and ([+-]).* px down", flags[0].advice)
@@ -37,21 +39,21 @@ def test_a_jump_is_flagged_once_with_its_size(down: float, across: float) -> Non
 
 
 def test_a_slip_of_the_stage_is_counted_in_steps() -> None:
-    flags = only(jumping(0, 0, slip=5))
+    flags = of_motion(jumping(0, 0, slip=5))
     assert [flag.frame for flag in flags] == [50]
     assert flags[0].score == pytest.approx(5, abs=0.7)
     assert "steps more than its step" in flags[0].advice
 
 
 def test_a_quarter_of_a_pixel_is_no_finding() -> None:
-    assert only(jumping(0.2, 0.2)) == []
+    assert of_motion(jumping(0.2, 0.2)) == []
 
 
 def test_vibration_raises_the_limit() -> None:
     scan = Blobs(120)
     rng = np.random.default_rng(4)
     scan.depth = lambda view, image: scan.line_integrals(view, tuple(rng.normal(0, 0.4 / BLOCK, 2)))
-    assert [flag.level for flag in only(scan)] == [Level.WARN]  # it is named, and no view is a jump
+    assert [flag.level for flag in of_motion(scan)] == [Level.WARN]  # it is named, and no view is a jump
 
 
 GHOSTS = [(0.6, 8.0, 30.0), (0.3, 3.0, 12.0), (0.1, 15.0, 30.0), (-0.1, 8.0, 30.0), (-0.3, 15.0, 12.0)]
@@ -59,7 +61,7 @@ GHOSTS = [(0.6, 8.0, 30.0), (0.3, 3.0, 12.0), (0.1, 15.0, 30.0), (-0.1, 8.0, 30.
 
 @pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
 def test_the_edges_of_a_ghost_are_no_jump(gain: float, speed: float, half_width: float) -> None:
-    assert only(Blobs(80, counts=fog(gain, speed, half_width))) == []
+    assert of_motion(Blobs(80, counts=fog(gain, speed, half_width))) == []
 
 
 @pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
@@ -68,4 +70,60 @@ def test_a_jump_behind_a_ghost_is_one(gain: float, speed: float, half_width: flo
     scan = jumping(*shift)
     ghost = fog(gain, speed, half_width)
     scan.counts = lambda view, light: ghost(view + 17, light)  # in the field from view 33 on at the latest
-    assert 50 in [flag.frame for flag in only(scan)]
+    assert 50 in [flag.frame for flag in of_motion(scan)]
+
+
+SPOTLESS = [check for check in CHECKS if check.name != "pixels"]  # these scans have previews and no pixels
+
+
+def shaking(
+    across: float, down: float, views: int = 150, seed: int = 3, creep: float = 0.0, step: float = np.pi / 300
+) -> list[Flag]:
+    """The flags of a scan whose views stand beside the sample's way, standard deviations in pixels; `creep` pixels a
+    view."""
+    places = np.random.default_rng(seed).normal(size=(views, 2)) * (down, across)
+    places[:, 1] += creep * np.arange(views)
+    scan = Blobs(views, step=step, seed=seed)
+    scan.depth = lambda view, image: scan.line_integrals(view, (places[view, 0] / BLOCK, places[view, 1] / BLOCK))
+    return scan.flags(SPOTLESS, step=step)
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "seed"), others_slow([(0.4, 0.9, 0), (1.3, 0.35, 2), (0.65, 0.65, 1), (0.65, 0.65, 7)], 2)
+)
+def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, down: float, seed: int) -> None:
+    flags = [flag for flag in shaking(across, down, seed=seed) if flag.level is not Level.INFO]
+    assert [(flag.check, flag.level) for flag in flags] == [("motion", Level.WARN)]
+    told = [float(size) for size in re.findall(r"stand ([\d.]+) px across and ([\d.]+) px down", flags[0].advice)[0]]
+    assert told == pytest.approx([across, down], rel=0.35)
+    assert "`beamline recon --calibrate shifts`" in flags[0].advice
+
+
+@pytest.mark.parametrize("direction", [(0.6, 0.0), (0.0, 0.6)])
+def test_the_other_direction_stays_small(direction: tuple[float, float]) -> None:
+    (flag,) = (flag for flag in shaking(*direction) if flag.check == "motion")
+    told = [float(size) for size in re.findall(r"stand ([\d.]+) px across and ([\d.]+) px down", flag.advice)[0]]
+    assert min(told) < 0.15 < 0.4 < max(told)
+
+
+@pytest.mark.parametrize(
+    ("seed", "step", "creep"), others_slow([(0, 0.004, 0.0), (2, 0.03, -0.1), (1, 0.01, 0.02), (3, 0.03, 0.0)], 2)
+)
+def test_a_sample_that_turns_and_creeps_does_not_shake(seed: int, step: float, creep: float) -> None:
+    assert not [flag for flag in shaking(0, 0, seed=seed, creep=creep, step=step) if "shakes" in flag.advice]
+
+
+def test_a_jump_is_no_shake() -> None:
+    scan = Blobs(150, step=0.01)
+    scan.depth = lambda view, image: scan.line_integrals(view, (0.0, 1.0 if view > 80 else 0.0))
+    flags = [flag for flag in scan.flags([MotionCheck()], step=0.01) if flag.check == "motion"]
+    assert [flag.level for flag in flags] == [Level.ALARM]
+
+
+def test_a_shake_that_begins_later_is_told_once() -> None:
+    places = np.random.default_rng(1).normal(size=(240, 2)) * 0.2
+    places[:120] = 0
+    scan = Blobs(240, step=0.01)
+    scan.depth = lambda view, image: scan.line_integrals(view, tuple(places[view]))
+    flags = [flag for flag in scan.flags([MotionCheck()], step=0.01) if flag.level is Level.WARN]
+    assert 1 <= len(flags) <= 2 and flags[0].frame - 10 < 170

@@ -1,6 +1,8 @@
 """What the page reads of a scan file is what stands in it, also while it grows."""
 
 import json
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import h5py
@@ -23,34 +25,32 @@ SCAN = TwoCylinders()
 WHOLE = TileRegion(0, 4, 0, 40)
 
 
-def test_a_view_over_the_flats_is_the_transmission(tmp_path: Path) -> None:
-    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+@pytest.fixture
+def recording(tmp_path: Path) -> Iterator[Recording]:
+    with closing(Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))) as recording:
+        yield recording
+
+
+def test_a_view_over_the_flats_is_the_transmission(recording: Recording) -> None:
     values, region, factor = recording.picture(10, WHOLE, corrected=True)
-    recording.close()
     assert (region, factor) == (WHOLE, 1)
     np.testing.assert_allclose(values, np.exp(-SCAN.line_integrals()[6]), atol=2e-4)
 
 
-def test_without_correction_a_view_is_counts(tmp_path: Path) -> None:
-    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+def test_without_correction_a_view_is_counts(recording: Recording) -> None:
     values, *_ = recording.picture(10, TileRegion(1, 3, 5, 20), corrected=False)
-    recording.close()
     np.testing.assert_array_equal(values, SCAN.counts()[6, 1:3, 5:20])
 
 
-def test_the_sinogram_is_a_row_of_the_views_alone(tmp_path: Path) -> None:
-    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+def test_the_sinogram_is_a_row_of_the_views_alone(recording: Recording) -> None:
     lines, views, factor = recording.sinogram(2, first=14)
-    recording.close()
     assert (factor, views.tolist()) == (1, list(range(14, 4 + SCAN.angles.size)))
     np.testing.assert_array_equal(lines, SCAN.counts()[10:, 2])
 
 
-def test_a_region_s_trace_is_its_mean_in_each_frame(tmp_path: Path) -> None:
+def test_a_region_s_trace_is_its_mean_in_each_frame(recording: Recording) -> None:
     frames = frames_of(SCAN)
-    recording = Recording(write_flagged(tmp_path / "scan.h5", frames, {}))
     trace = recording.trace(TileRegion(0, 4, 8, 16), first=3)
-    recording.close()
     np.testing.assert_allclose(trace, [frame.counts[:, 8:16].mean() for frame in frames[3:]], rtol=1e-5)
 
 
@@ -93,11 +93,9 @@ def test_a_growing_file_shows_each_frame_as_it_is_committed(tmp_path: Path) -> N
         recording.close()
 
 
-def test_a_frame_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+def test_a_frame_that_is_not_there_is_refused(recording: Recording) -> None:
     with pytest.raises(DataError, match="Frame 999 is"):
         recording.picture(999, WHOLE, corrected=True)
-    recording.close()
 
 
 def test_a_scan_that_has_no_file_yet_is_not_ready(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level, Look
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
-from beamline.monitor.saturation import SaturationCheck
+from beamline.monitor.frames import SaturationCheck
 from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay, verdict
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo

@@ -16,7 +16,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, origin_of
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
+from beamline.storage.writers.recon_file import Checkpoint, write_checkpoint
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of

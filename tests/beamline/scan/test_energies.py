@@ -22,7 +22,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
 from drivers.base.frame import FrameKind
 from simulators.devices.camera import SimulatedOrcaQuest
-from simulators.samples.materials.palette import known
+from simulators.samples.materials.materials import known
 
 pytest.importorskip("xraylib")
 ENERGIES = (8.32, 8.345, 8.3485, 8.352)

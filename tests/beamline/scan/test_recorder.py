@@ -19,7 +19,7 @@ from beamline.core.events import Event, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.mass import MassCheck
+from beamline.monitor.field import MassCheck
 from beamline.monitor.watch import Monitor, start
 from beamline.scan import recorder as module
 from beamline.scan import run as run_module

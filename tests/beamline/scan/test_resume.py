@@ -18,9 +18,8 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.files import parts_of
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
@@ -33,8 +32,8 @@ from beamline.scan.run import run_scan
 from beamline.scan.states import State
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, joined_file_of
+from beamline.storage.readers.changed import OverlaidSource
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.writer_lock import QUIET, WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter

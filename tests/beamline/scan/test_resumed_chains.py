@@ -18,8 +18,7 @@ from beamline.core.errors import BeamlineError, DataError
 from beamline.core.files import parts_of
 from beamline.core.stop import StopRequest
 from beamline.features.archive.archive import archive
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage import parts

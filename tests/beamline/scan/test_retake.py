@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.config.load import load
 from beamline.core.stop import ScanStopped, StopRequest
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
 from beamline.scan.run import run_scan

@@ -11,8 +11,7 @@ import pytest
 from beamline.config.load import config_folder, load
 from beamline.core.events import Event
 from beamline.core.stop import ScanStopped, StopRequest
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.projections.flagged_frames import returned_views
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import open_for_resume

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import BeamlineError, exit_code
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.monitor.check import Flag, Level, Look
-from beamline.monitor.mass import MassCheck
+from beamline.monitor.field import MassCheck
 from beamline.scan import recorder
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter

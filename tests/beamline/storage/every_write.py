@@ -27,8 +27,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.parts import views_in

@@ -17,7 +17,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.storage import disk_file, hdf5
 from beamline.storage.disk_file import DiskFile
-from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from beamline.storage.writers.recon_file import Checkpoint, read_checkpoint, write_checkpoint
 
 FACTS = 12
 CUBE = np.arange(6 * 16 * 16, dtype=np.float32).reshape(6, 16, 16)

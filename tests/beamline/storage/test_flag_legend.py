@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import describe
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import ALARM_SHIFT, CHECKS, bitmask
 from beamline.monitor.digest import digest
@@ -99,21 +99,26 @@ def test_marks_become_flags_and_flags_marks() -> None:
 
 
 def test_a_finding_that_needed_several_views_marks_them_all_in_the_file_as_in_memory(tmp_path: Path) -> None:
-    found: list[list[Flag]] = [[] for _ in range(9)]
+    """Also a crumb that moves, found three views after the last one that shows it."""
+    found: list[list[Flag]] = [[] for _ in range(12)]
     found[5] = [Flag("floater", Level.WARN, 5, 7.0, 4.5, "", (0, 1, 2, 3), first=2)]
     found[6] = [Flag("floater", Level.WARN, 6, 6.0, 4.5, ""), Flag("ghost", Level.ALARM, 6, 0.2, 0.1, "", first=5)]
+    found[11] = [Flag("floater", Level.WARN, 9, 8.0, 7.0, "", (0, 2, 4, 6), first=7, from_region=(0, 2, 0, 2))]
     flags = FrameFlags.of_flags(found)
-    assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4, 5, 6] and flags.alarmed.nonzero()[0].tolist() == [5, 6]
-    assert flags.counts() == {"floater": {"warn": 5}, "ghost": {"alarm": 2}}
+    assert flags.flagged.nonzero()[0].tolist() == [*range(2, 10)] and flags.alarmed.nonzero()[0].tolist() == [5, 6]
+    assert flags.counts() == {"floater": {"warn": 8}, "ghost": {"alarm": 2}}
     with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
         frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
         for row, each in enumerate(found):
             writer.append(replace(frame, index=row), digest(frame.counts), each)
     with h5py.File(writer.path) as file:
-        log = file["entry/frame_log"]
-        np.testing.assert_array_equal(log["flags"][()], flags.bits)
-        np.testing.assert_array_equal(log["frame_valid"][()], ~flags.alarmed)
-        np.testing.assert_array_equal(log["flag_scores"][()], flags.scores)
+        log, at = file["entry/frame_log"], NAMES.index("floater")
+        np.testing.assert_array_equal(log["flags"], flags.bits)
+        np.testing.assert_array_equal(log["frame_valid"], ~flags.alarmed)
+        np.testing.assert_array_equal(log["flag_scores"], flags.scores)
+        np.testing.assert_array_equal(log["flag_regions"], flags.regions)
+        assert log["flag_regions"][7:10, at].tolist() == [[0, 2, 0, 2], [0, 2, 2, 4], [0, 2, 4, 6]]
+        assert log["flag_scores"][9, at] == 8.0
 
 
 def test_the_legend_is_there_before_the_first_frame(tmp_path: Path) -> None:
@@ -140,24 +145,3 @@ def test_counting_undoes_the_bitmask(found: list[dict[str, Level]]) -> None:
     assert flags.alarmed.tolist() == [Level.ALARM in frame.values() for frame in found]
     assert flags.after(3).alarmed.tolist() == [False] * 3 + flags.alarmed.tolist()
     assert flags.of(flags.alarmed).flagged.all()
-
-
-def test_a_finding_of_earlier_views_has_its_place_in_each_of_them_in_the_file_as_in_memory(tmp_path: Path) -> None:
-    """A crumb that moves, found three views after the last one that shows it."""
-    moving = Flag("floater", Level.WARN, 4, 8.0, 7.0, "", (0, 2, 4, 6), first=2, from_region=(0, 2, 0, 2))
-    found: list[list[Flag]] = [[] for _ in range(9)]
-    found[7] = [moving]
-    flags = FrameFlags.of_flags(found)
-    assert flags.flagged.nonzero()[0].tolist() == [2, 3, 4]
-    assert flags.scores is not None and flags.regions is not None
-    with NXtomoWriter(tmp_path / "s.h5", ScanInfo("s"), (4, 6), clock=SteppedClock(EPOCH)) as writer:
-        frame = Frame(np.zeros((4, 6), np.uint16), FrameKind.PROJECTION, 0, 0, 0, 0.0, 1.8e9, 0.1)
-        for row, each in enumerate(found):
-            writer.append(replace(frame, index=row), digest(frame.counts), each)
-    with h5py.File(writer.path) as file:
-        log, at = file["entry/frame_log"], [check.name for check in CHECKS].index("floater")
-        np.testing.assert_array_equal(log["flags"], flags.bits)
-        np.testing.assert_array_equal(log["flag_regions"], flags.regions)
-        np.testing.assert_array_equal(log["flag_scores"], flags.scores)
-        assert log["flag_regions"][2:5, at].tolist() == [[0, 2, 0, 2], [0, 2, 2, 4], [0, 2, 4, 6]]
-        assert log["flag_scores"][4, at] == 8.0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 from beamline.storage.structure import dtype_of, require_held, shape_of
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume, write_volume
@@ -21,21 +21,8 @@ from beamline.storage.volumes.images import tiff
 from tests.beamline.storage.volumes.test_files import RECORD
 
 NUMBERS: tuple[Any, ...] = (
-    0,
-    -1,
-    1.5,
-    "abc",
-    None,
-    True,
-    [],
-    {},
-    2**31,
-    2**62,
-    10**4000,
-    -(10**400),
-    1e300,
-    "9" * 5000,
-)
+    0, -1, 1.5, "abc", None, True, [], {}, 2**31, 2**62, 10**4000, -(10**400), 1e300, "9" * 5000,
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("n", NUMBERS, ids=range(len(NUMBERS)))

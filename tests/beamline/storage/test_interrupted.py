@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
+from beamline.features.files.validate import describe
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.interrupted import next_step, scan_file, volume_file

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import describe
 from beamline.storage.hdf5 import opened_itself
 from beamline.storage.readers.open import open_scan
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange, write_flagged

@@ -12,9 +12,8 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.features.archive.archive import archive
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import replay
 from beamline.storage.parts import views_in
 from beamline.storage.readers.open import open_scan

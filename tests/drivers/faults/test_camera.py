@@ -10,7 +10,7 @@ import pytest
 
 from beamline.config.devices import DcamOrca
 from beamline.features.doctor import devices as doctor
-from beamline.features.doctor.check import Grade
+from beamline.features.doctor.devices import Grade
 from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property

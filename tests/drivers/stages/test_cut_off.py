@@ -10,13 +10,14 @@ import pytest
 from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
-from tests.drivers.stages.rigs import NAMES, RIGS, AnyRig, RigOf, every_stage
+from tests.drivers.stages.rig import NAMES, StageRig
+from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
 
 
 class Deaf:
     """A cable on which, while `dead`, nothing comes back; what is sent arrives."""
 
-    def __init__(self, rig: AnyRig) -> None:
+    def __init__(self, rig: StageRig) -> None:
         self.clock, self._rig = rig.clock, rig
         self.dead = False
 

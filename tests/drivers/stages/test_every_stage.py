@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -98,6 +99,38 @@ def test_a_count_is_a_count_whether_a_turn_has_few_or_many(rig_of: RigOf, counts
         [first, first + interval, first + 2 * interval], abs=0.2
     )  # the clock's float of today
     stage.close()
+
+
+@every_stage
+def test_the_limits_that_the_stage_names_are_those_that_it_has(rig_of: RigOf) -> None:
+    rig = rig_of()
+    stage = rig.open()
+    limits = stage.limits
+    named = [math.degrees(figure) for figure in (limits.max_speed, limits.low, limits.high)]
+    assert named == pytest.approx([30, -5, 100], rel=1e-3)
+    assert 0.9 * math.radians(60) < limits.acceleration <= math.radians(60)
+    stage.start_move(math.radians(60), math.radians(30))
+    rig.clock.sleep(0.25)
+    assert rig.line.angle_at(rig.clock.now()) == pytest.approx(0.5 * limits.acceleration * 0.25**2, rel=1e-5)
+    stage.close()
+
+
+@pytest.mark.parametrize(
+    ("maker", "build", "said"),
+    [
+        ("pm16c", {}, ["REM", "FLB+20000", "BLB-2000", "SETLSB10000000"]),
+        ("pi_gcs", {"low": -8.0, "high": 80.0}, []),
+        ("zaber", {"low": -8000, "high": 80_000}, []),
+    ],
+)
+def test_limits_in_the_controller_that_leave_no_room_are_respected(maker: str, build: Any, said: list[str]) -> None:
+    rig = RIGS[maker](**build)
+    for command in said:
+        rig.say(command)
+    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
+        with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
+            rig.open(**limits)
+    rig.open(low=math.radians(-8), high=math.radians(80)).close()
 
 
 # somebody else's controller

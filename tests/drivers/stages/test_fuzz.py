@@ -19,7 +19,7 @@ from simulators.wires.serial_url import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans
 from tests.drivers.stages import pi_gcs_rig
-from tests.drivers.stages.rigs import NAMES, AnyRig
+from tests.drivers.stages.rig import NAMES, StageRig
 
 TIMEOUT = 0.2
 LONG = 2.0
@@ -54,7 +54,7 @@ class Fuzzed:
         wire: puts the pieces of a plan in the place of replies.
     """
 
-    rig: Callable[[], AnyRig]
+    rig: Callable[[], StageRig]
     samples: Sequence[bytes]
     replies_to_open: int
     disarmed: Callable[[Any], bool]
@@ -128,7 +128,7 @@ FUZZED = {
 }
 
 
-def opened(rig: AnyRig, wire: FuzzedWire) -> RotationStage | DeviceError:
+def opened(rig: StageRig, wire: FuzzedWire) -> RotationStage | DeviceError:
     rig.url = register(next(NAMES), wire)
     return allowed(lambda: rig.open(timeout=TIMEOUT), rig.clock, WITHIN)
 

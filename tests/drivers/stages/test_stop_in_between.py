@@ -12,14 +12,15 @@ import pytest
 from drivers.base.errors import DeviceError
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
-from tests.drivers.stages.rigs import NAMES, AnyRig, RigOf, every_stage
+from tests.drivers.stages.rig import NAMES, StageRig
+from tests.drivers.stages.rigs import RigOf, every_stage
 
 
 class StopInBetween:
     """A cable on which another thread's stop comes in while the driver waits for an answer; also the clock of both:
     for the thread that stops, time stands until `begun` is set."""
 
-    def __init__(self, rig: AnyRig) -> None:
+    def __init__(self, rig: StageRig) -> None:
         self.clock, self._rig, self._time = self, rig, rig.clock
         self.begun = threading.Event()
         self._mover, self._heard = threading.current_thread(), threading.Event()

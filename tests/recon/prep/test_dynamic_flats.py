@@ -9,7 +9,7 @@ from scipy import ndimage
 
 import recon
 from recon.prep.dynamic_flats import DynamicFlats, find_dynamic_flats
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 

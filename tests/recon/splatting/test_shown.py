@@ -16,7 +16,7 @@ from recon.splatting.in_time import LastRound
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingFit
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock

@@ -20,7 +20,7 @@ from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import DensityPolicy, FitSettings
 from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock

@@ -25,7 +25,7 @@ from recon.splatting.splat import project as gaussian_views
 from recon.splatting.splat import voxelize
 from recon.voxels.direct import fdk
 from recon.voxels.projector import Projector, project
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Ellipsoid
 from tests.recon.helpers import data_residual

@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.volume import Grid
 from simulators.effects.catalogue import CATALOGUE
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Pose, Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
 from tests.simulators import shots

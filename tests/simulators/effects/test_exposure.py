@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from simulators.effects.exposure import BeamProfile, MotionBlur, PixelArea
 from simulators.frame import sensor
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.scenes.expose import expose
 from tests.simulators import shots
 

@@ -13,8 +13,7 @@ import pytest
 from numba import config
 
 from simulators.effects.catalogue import CATALOGUE
-from simulators.frame.detector import Detector
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
 from tests.simulators import shots

@@ -1,10 +1,12 @@
-"""Broad blur: transfers against their kernels, no light lost, none below zero, whatever the shape and the width."""
+"""A broad blur, and the bands of rows that threads share."""
 
 from __future__ import annotations
 
 import math
+import threading
 from itertools import pairwise
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import j0
 
+from simulators.pixels import bands
 from simulators.pixels.broad_blur import Transfer, add_enlarged, broad_blur, exponential, gaussian, lorentzian
 
 KERNELS = {
@@ -96,3 +99,27 @@ def test_an_even_image_stays_and_a_tiny_width_changes_nothing() -> None:
     np.testing.assert_allclose(_blurred(np.full((24, 36), 7.0), 20.0, exponential), 7.0, rtol=1e-12)
     image = np.random.default_rng(1).random((24, 36))
     np.testing.assert_allclose(_blurred(image, 1e-6, lorentzian), image, atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+@pytest.mark.parametrize("shape", [(1, 100_000), (5, 100_000), (1000, 100), (3, 4)])
+def test_every_row_is_done_once(monkeypatch: pytest.MonkeyPatch, threads: int, shape: tuple[int, int]) -> None:
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", threads)
+    rows: list[int] = []
+    bands.share_rows(lambda first, end: rows.extend(range(first, end)), shape)
+    assert sorted(rows) == list(range(shape[0]))
+
+
+def test_small_frames_stay_in_their_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    seen: list[threading.Thread] = []
+    bands.share_rows(lambda first, end: seen.append(threading.current_thread()), (64, 64))
+    assert seen == [threading.current_thread()]
+    bands.share_rows(lambda first, end: seen.append(threading.current_thread()), (2048, 64))
+    assert threading.current_thread() not in seen[1:]
+
+
+def test_an_error_comes_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    with pytest.raises(ZeroDivisionError):
+        bands.share_rows(lambda first, end: 1 // 0, (1000, 1000))

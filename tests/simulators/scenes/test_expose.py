@@ -16,9 +16,8 @@ from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.orca_quest import timing
 from simulators.effects.chain import Chain
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid

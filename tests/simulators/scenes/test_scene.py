@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
 from simulators.effects.chain import Chain
 from simulators.frame import sensor
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import load_scene
 from tests.simulators import shots

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections.abc import Callable
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from simulators.wires.wire import BytesWire
 from tests.drivers import zaber_rig
 from tests.drivers.fuzz import received, replies
 from tests.drivers.stages import pi_gcs_rig
@@ -40,6 +43,35 @@ ZABER = [
         "0 io set do 1 1 schedule 1 0", "0 io get do 1", "1 warnings clear", "0 1 get pos:7D",
     )
 ]  # fmt: skip
+
+Box = Callable[[], BytesWire]
+
+
+@pytest.mark.parametrize(
+    ("box", "asked", "answer"),
+    [
+        (
+            lambda: pi_gcs_rig.Rig(wire={"latency": 0.0}).controller,
+            b"POS? 1\nCSV?\n\x05TRO?\n",
+            b"1=0.000000\n2.0\n0\n1=0 \n2=0 \n3=0 \n4=0\n",
+        ),
+        (lambda: Wire().box, b"PS?0\r\nSTQ?\r\nSPD?0\r\n", b"+0000000\r\nR4\r\nHSPD\r\n"),
+        (
+            lambda: zaber_rig.Rig().controller,
+            b"/1 1 1\n/1 0 2 get version\r\n/1 1 3 get pos\r",
+            b"@01 1 1 OK IDLE -- 0\r\n@01 0 2 OK IDLE -- 7.38\r\n@01 1 3 OK IDLE -- 0\r\n",
+        ),
+    ],
+    ids=["pi_gcs", "pm16c", "zaber"],
+)
+@given(sizes=st.lists(st.integers(1, 9), max_size=14))
+def test_bytes_may_come_in_pieces_of_any_size(box: Box, asked: bytes, answer: bytes, sizes: list[int]) -> None:
+    controller = box()
+    for size in sizes:
+        controller.receive(asked[:size])
+        asked = asked[size:]
+    controller.receive(asked)
+    assert controller.transmit() == answer
 
 
 @given(st.lists(st.tuples(received(PI_GCS), st.floats(0.0, 3.0)), max_size=12))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, EmissionCounts, EmissionOf, Opening, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, EmissionCounts, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from drivers.base.frame import FrameKind
 
@@ -42,15 +42,11 @@ class EmissionSource(StacksSource):
             raise DataError(f"{path}: {angles.size} angles for {self.angles.size} views; expected one for each.")
         self.angles = angles
         self.pixel_size_mm = hdf5.scalar(file, f"{GROUP}/pixel_size", {"mm": 1.0})
-        self.axis_col = (self.shape[1] - 1) / 2
+        self.axis_col, self.emission = (self.shape[1] - 1) / 2, self._counted
 
     @property
     def checksummed(self) -> bool:
         return all(item.fletcher32 for item in (self._counts, *self._sets.values()))
-
-    @property
-    def emission(self) -> EmissionOf:
-        return self._counted
 
     def _counted(self, frames: NDArray[np.int64], rows: slice) -> EmissionCounts:
         counts = super().read(frames, rows)
@@ -79,11 +75,8 @@ def _open(path: Path, opening: Opening) -> EmissionSource:
     if opening.follow:
         raise DataError(f"{path} holds counts of an emission, which do not grow. Leave out --follow.")
     file = hdf5.open_hdf5(path)
-    try:
+    with hdf5.closed_on_error(file):
         return EmissionSource(path, file)
-    except BaseException:
-        file.close()
-        raise
 
 
 FORMAT = ScanFormat("/emission/counts (emission)", _recognises, _open)

@@ -168,13 +168,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
         raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
     angles = angles_of(series)
     plain = series if angles is None else [without_angle(name) for name in series]
-    counted = _numbers(plain)
-    if counted is None or (len({_template(name) for name in plain}) > 1 and not one_series):
-        if len(series) > 1 and (angles is None or len({_template(name) for name in plain}) > 1):
-            raise DataError(_several_series(path, plain))
-        ordered = {name: i for i, name in enumerate(natural_sorted(set(plain)))}
-        counted = np.array([ordered[name] for name in plain], np.int64)
-    taken = np.argsort(counted, kind="stable")
+    taken = np.argsort(_places(path, plain, angles is not None, one_series=one_series), kind="stable")
     series, angles = [series[i] for i in taken], None if angles is None else angles[taken]
     references = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
     names = references + series
@@ -185,6 +179,17 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
     if together is None and of_series is not None:
         together = np.concatenate([np.full(len(references), -1), of_series])
     return NamedImages(names, np.array([kinds[name] for name in names], np.int32), of_angles, together, of_series)
+
+
+def _places(path: object, plain: list[str], angles_known: bool, *, one_series: bool) -> NDArray[np.int64]:
+    """The number of each image of a series, by its name without an angle. DataError: there are several series."""
+    counted, several = _numbers(plain), len({_template(name) for name in plain}) > 1
+    if counted is not None and (one_series or not several):
+        return counted
+    if len(plain) > 1 and (several or not angles_known):
+        raise DataError(_several_series(path, plain))
+    ordered = {name: i for i, name in enumerate(natural_sorted(set(plain)))}
+    return np.array([ordered[name] for name in plain], np.int64)
 
 
 def _template(name: str) -> str:

@@ -38,6 +38,13 @@ _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+_SECOND_NUMBER = NotUsed(
+    "a second number in the names of the images",
+    "which counts them in another order than the first",
+    "images are in the order of the number that counts closest; if angles are in the order of the other, leave one of "
+    "them out of the names",
+    True,
+)
 
 
 class TiffSeriesSource(ScanSource):
@@ -49,7 +56,7 @@ class TiffSeriesSource(ScanSource):
         """Open. `one_series`: all images are one numbered series, whatever the names say of kinds."""
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
-        try:
+        with hdf5.closed_on_error(self):
             names = self._names()
             images = in_order(path, [name for name in names if name.lower().endswith(SUFFIXES)], one_series=one_series)
             self._files, self.image_key, self.angles = images.names, images.kinds, images.angles
@@ -63,25 +70,13 @@ class TiffSeriesSource(ScanSource):
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
-        except BaseException:
-            self.close()
-            raise
-        self._two_orders = two_orders([without_angle(name) for name in series])
-        self._missing, gaps = _left_out(images)
+        missing, gaps = _left_out(images)
+        self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
+        if two_orders([without_angle(name) for name in series]):
+            self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        where, why = "a second number in the names of the images", "images are in the order of the number that counts "
-        why += "closest; if angles are in the order of the other, leave one of them out of the names"
-        second = NotUsed(where, "which counts them in another order than the first", why, True)
-        return (*offered(self), *((second,) if self._two_orders else ()))
-
-    @property
-    def ending(self) -> ScanEnding:
-        return ScanEnding(missing=self._missing)
 
     @property
     def angle_text(self) -> tuple[str, str] | None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
     SUFFIXES,
@@ -55,6 +55,7 @@ class TiffStackSource(ScanSource):
         self.angles = np.full(n, np.nan)
         self.exposures = np.full(n, np.nan)
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
+        self.not_used = offered(self)
 
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
@@ -81,10 +82,6 @@ class TiffStackSource(ScanSource):
         if one_by_one:
             return len(self._tif.pages)
         return 1 if len(series.shape) == 2 else int(series.shape[0])
-
-    @property
-    def not_used(self) -> tuple[NotUsed, ...]:
-        return offered(self)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)

@@ -89,32 +89,6 @@ class _Views:
         return out
 
 
-class TxrmSource(StacksSource):
-    """A scan of a .txrm, whose views may be displaced."""
-
-    _shifts: NDArray[np.float64] | None = None
-    _ending = ScanEnding()
-
-    def set_ending(self, taken: int, planned: int) -> None:
-        """How many of the planned views were taken."""
-        if taken < planned:
-            self._ending = ScanEnding("stopped", reason=f"{taken} of {count(planned, 'planned view')} were taken.")
-
-    def set_shifts(self, shifts: NDArray[np.float64]) -> None:
-        """Of the views, [view, 2]."""
-        if shifts.any():
-            self._shifts = np.full((self.image_key.size, 2), np.nan)
-            self._shifts[-len(shifts) :] = shifts
-
-    @property
-    def shifts(self) -> NDArray[np.float64] | None:
-        return self._shifts
-
-    @property
-    def ending(self) -> ScanEnding:
-        return self._ending
-
-
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open. `own_angles` False: the caller brings the angles, so the file may lack them.
 
@@ -122,11 +96,8 @@ def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """
     with hdf5.readable(path):
         file = TxrmFile(path)
-        try:
+        with hdf5.closed_on_error(file):
             return _source(path, file, own_angles)
-        except BaseException:
-            file.close()
-            raise
 
 
 def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
@@ -155,9 +126,12 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
             FrameStack(FrameKind.FLAT, "ReferenceData/Image", flat),
             *stacks,
         ]
-    source = TxrmSource(path, file, stacks, format="txrm", facts=_facts(file))
-    source.set_shifts(_shifts(path, file, n))
-    source.set_ending(n, planned)
+    source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
+    if (shifts := _shifts(path, file, n)).any():
+        source.stated_shifts = np.full((source.image_key.size, 2), np.nan)
+        source.stated_shifts[-n:] = shifts
+    if n < planned:
+        source.stated_ending = ScanEnding("stopped", reason=f"{n} of {count(planned, 'planned view')} were taken.")
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:

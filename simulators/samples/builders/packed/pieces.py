@@ -211,7 +211,7 @@ def _of_materials(
     where: str, pieces: Sequence[Piece], material_of: Mapping[str, str], materials: Any, beam: Beam
 ) -> Sample:
     """The pieces with a material for each role; `materials` are the scene's own, see `palette_of`."""
-    from simulators.samples.materials.palette import palette_of
+    from simulators.samples.materials.materials import palette_of
     from simulators.samples.materials.parts import Part, sample_of
 
     palette = palette_of(f"{where}.materials", materials)

@@ -1,4 +1,4 @@
-"""Films of slices: what Pillow reads back, image by image, and what is left of one that failed."""
+"""Films of volumes and of views."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from PIL import Image, ImageSequence
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.features.export import film_file as film
-from beamline.features.export.film_file import FilmStyle, slices_along, thinned, write_film
+from beamline.features.export.film_file import FilmStyle, slices_along, thinned, views_by_angle, write_film
 from beamline.storage.volumes.base import bare_record
 from recon.base.greys import matter_window
+from tests.beamline.array_source import ArraySource
 
 VOLUME = np.random.default_rng(3).random((7, 9, 11)).astype(np.float32)
 GREYS = np.rint(255 * VOLUME).astype(int)
@@ -98,3 +99,20 @@ def test_ffmpeg_gets_every_image_and_its_complaint_is_told(tmp_path: Path, monke
     with pytest.raises(ConfigError, match=r"name a \.gif"):
         write_film(tmp_path / "g.mp4", images, style, lambda n, of: None)
     assert not list(tmp_path.glob("*g.mp4*"))
+
+
+def images_of(views: int, damaged: set[int]) -> list[float]:
+    light = np.array([100, 1100] + [600] * views, np.uint16)  # a dark, a flat, and the views
+    frames = np.broadcast_to(light[:, None, None], (light.size, 6, 8)).copy()
+    source = ArraySource(frames, [2, 1] + [0] * views, np.array([0, 0, *range(views, 0, -1)], np.float64))
+    source.damaged = frozenset(damaged)
+    return [float(image.mean()) for image in views_by_angle(source, 64, lambda sentence: None).read()]
+
+
+def test_a_damaged_view_is_left_out() -> None:
+    assert images_of(3, damaged={3}) == pytest.approx([np.log(2)] * 2, abs=1e-5)
+
+
+def test_a_scan_without_a_usable_view_is_refused() -> None:
+    with pytest.raises(DataError, match="can be used"):
+        images_of(2, damaged={2, 3})

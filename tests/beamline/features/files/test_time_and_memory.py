@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from beamline.features.files import describe as described
+from beamline.features.files import validate as described
 from beamline.storage.readers import no_data, wrapped
 from tests.beamline.scans import TwoCylinders, write_exchange
 

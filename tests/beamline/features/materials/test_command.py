@@ -30,7 +30,7 @@ from drivers.base.clock import Clock, SystemClock
 from recon.base.method import Progress
 from recon.base.ray_width import RayWidth
 from recon.features.joint import spectral
-from simulators.samples.materials.palette import known
+from simulators.samples.materials.materials import known
 
 pytest.importorskip("xraylib")
 TRIED = spectral.weights_by_views

@@ -1,4 +1,6 @@
-"""Runs in the browser: their table, and the page of each below a number of the server's own."""
+"""The page of a folder of runs, and its list on the terminal."""
+
+from __future__ import annotations
 
 import json
 import os
@@ -13,8 +15,11 @@ import pytest
 from beamline.features.page import app, serve
 from beamline.features.page import run_browser as runs
 from beamline.page.run_files import EventLog
+from tests.beamline.cli.small_scan import beamline
+from tests.beamline.fakes import FakeInstrument
 from tests.beamline.features.page.served import Served, listed
 from tests.beamline.features.page.test_app import tile
+from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
@@ -169,3 +174,30 @@ def test_a_log_is_read_without_its_bad_lines(tmp_path: Path) -> None:
         file.write(good[0][20:].encode() + b"\n")
     log.refresh()
     assert log.lines[2:] == [good[0]]
+
+
+def test_a_line_a_run_newest_first(tmp_path: Path) -> None:
+    Ran(tmp_path, FakeInstrument(), "sample.name=cathode-3")
+    (tmp_path / "2020-01-02T03-04-05_\x1b[31mred").mkdir()
+    (tmp_path / "2020-01-02T03-04-05_\x1b[31mred" / "events.jsonl").touch()
+    result = beamline("runs", str(tmp_path))
+    head, first, second = result.stdout.splitlines()
+    assert result.exit_code == 0
+    assert head.split()[:3] == ["time", "(UTC)", "sample"]
+    assert first.split()[2:5] == ["cathode-3", "19", "done"] and first.endswith("_cathode-3")
+    assert second.startswith("2020-01-02 03:04:05  \\x1b[31mred") and "\x1b" not in result.stdout
+    (line,) = beamline("runs", str(tmp_path), "--json").stdout.splitlines()
+    done = json.loads(line)
+    assert done["event"] == "done"
+    assert [(run["sample"], run["frames"], run["state"]) for run in done["runs"]] == [
+        ("cathode-3", 19, "done"), ("\x1b[31mred", None, "died"),
+    ]  # fmt: skip
+
+
+def test_no_run_is_no_error_and_no_folder_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = beamline("runs")
+    assert result.exit_code == 2 and "no folder runs" in result.stderr
+    (tmp_path / "runs").mkdir()
+    result = beamline("runs")
+    assert (result.exit_code, result.stdout) == (0, "") and "no run in runs" in result.stderr

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
-from beamline.features.page.view import _scan
+from beamline.features.page.command import _scan
 from beamline.page.shown_scan import ShownScan
 from beamline.page.tiles import TileRegion
 from beamline.storage.readers.open import open_scan

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.page import view as view_command
+from beamline.features.page import command as view_command
 from beamline.page import volume as volume_file
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume

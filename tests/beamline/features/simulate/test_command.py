@@ -1,8 +1,9 @@
-"""`beamline simulate`: the file is a scan like any other, labels and truth belong to it, and nothing half stays."""
+"""`beamline simulate`: files, labels, truth, costs."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
 import signal
 import struct
@@ -17,14 +18,18 @@ from click.testing import CliRunner, Result
 from beamline.cli.main import main
 from beamline.core.shipped import shipped_scenes
 from beamline.features.simulate import command as module
-from beamline.features.simulate import figure, write
-from beamline.features.simulate.write import scan_of
+from beamline.features.simulate import write
+from beamline.features.simulate.write import scan_of, write_scan
+from beamline.projections.corrections.width import Width
+from beamline.projections.selection import Selection, geometry_of
 from beamline.scenes.scene_file import open_scene
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from simulators.devices.clock import VirtualClock
 from simulators.frame.shot import CannotExposeError
+from simulators.scenes.expose import Scan
 from tests.beamline.simulate.read_labels import read_labels
 
 SCENE = """
@@ -201,9 +206,9 @@ def test_thin_frames_have_a_truth_and_a_picture(folder: Path, shape: str) -> Non
 def test_a_picture_shows_views_from_the_first_to_the_last(folder: Path) -> None:
     scan = scan_of(open_scene("scene.yaml"), 0, 60, 0.0)
     # A dark, a flat, the frames asked for, and the rest evenly: views 0, 15, 30, 44, 59 are frames 4, 19, 34, 48, 63.
-    assert figure._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
-    assert figure._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
-    assert figure._chosen(scan_of(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
+    assert write._chosen(scan, (40,)) == [0, 2, 4, 19, 34, 40, 48, 63]
+    assert write._chosen(scan, (9, 9, 8, 7, 6, 5, 63)) == [0, 2, 5, 6, 7, 8, 9, 63]  # six kinds of anomaly have room
+    assert write._chosen(scan_of(open_scene("scene.yaml"), 0, 1, 0.0), ()) == [0, 2, 4]
 
 
 def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
@@ -268,3 +273,18 @@ def test_refused_before_anything_is_written(folder: Path, arguments: tuple[str, 
 def test_every_shipped_scene_can_be_simulated(folder: Path, name: str) -> None:
     result = _beamline("simulate", name, "--frames", "1", "--picture", "p.png")
     assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("effects", [["motion_blur", "rolling_shutter"], []])
+def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: list[str]) -> None:
+    sizes = ["detector.shape=[4, 16]", "scan.views=6", "scan.darks=1", "scan.flats=1", "phantom.n_particles=5"]
+    scene = open_scene("fast_fly", [*sizes, f"effects={effects}"])
+    scan = Scan.of(scene.scene)
+    write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
+    with open_scan(tmp_path / "scan.h5") as source:
+        geometry = geometry_of(source, Selection(), 7.5, source.angles[2:])
+        seen, done = Width(arc="auto").rays(source, Selection(), geometry)
+        assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
+    moved = math.radians(180) / 6 / scan.period * 0.012
+    assert seen.width.arc == pytest.approx(moved if effects else 0)
+    assert (done.sentence != "") == bool(effects)

@@ -19,7 +19,7 @@ from drivers.base.clock import SystemClock
 from recon.base.volume import Grid
 from recon.voxels.direct import fdk
 from recon.voxels.fbp import fbp
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from tests.beamline.storage.file_layout import names, paths, unmatched
 
 SCENE = """

@@ -1,22 +1,29 @@
-"""Tune: frames of a known beam give back its photons, transmission and noise, and the exposure that fills the range."""
+"""`beamline tune` and `align`."""
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from beamline.config.load import config_folder, load, plan_of
-from beamline.core.errors import InstrumentError
-from beamline.core.stop import StopRequest
+from beamline.config.load import Config, config_folder, load, plan_of
+from beamline.core.errors import InstrumentError, QualityError
+from beamline.core.stop import ScanStopped, StopRequest
+from beamline.features.tuning.align import Alignment, align
 from beamline.features.tuning.tune import TARGET, evaluate, tune
 from beamline.instrument.connect import connect
 from beamline.monitor.references import ReferenceLimits
 from drivers.base.frame import Frame, FrameKind
 from simulators.frame.sensor import CONVERSION, OFFSET
 from tests.beamline.acquired import assert_safe
+from tests.beamline.ball_scan import shipped, with_scene
+from tests.beamline.cli.small_scan import beamline
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import small
 
@@ -119,3 +126,95 @@ def test_lost_frames_are_the_cameras_fault_and_the_instrument_is_safe() -> None:
     with pytest.raises(InstrumentError, match="camera: frames are missing"):
         tune(small(), instrument.connected(), StopRequest(), lambda event: None)
     assert_safe(instrument)
+
+
+ROI = "devices.camera.roi=[1080, 1968, 144, 160]"
+
+
+def _scene(offset: float) -> Config:
+    """The battery with its axis `offset` sensor pixels right of the middle."""
+    settings = shipped("simulated", "simulation.clock=virtual", ROI)
+    scene: dict[str, Any] = {
+        "phantom": {"kind": "battery", "seed": 3, "field_of_view": [0.6, 0.5], "n_particles": 150},
+        "beam": {"photons_per_s": 2e5},
+        "axis_offset_px": offset,
+        "effects": ["photon_noise", "read_noise"],
+    }
+    return with_scene(settings, scene)
+
+
+def _aligned(settings: Config, angle: float | None = None) -> Alignment:
+    with connect(settings) as instrument:
+        found = align(settings, instrument, StopRequest(), lambda event: None, angle)
+        assert not instrument.devices.shutter.is_open()
+        assert instrument.devices.stage.position() == 0
+        return found
+
+
+@pytest.mark.parametrize("offset", [-4.0, 6.3])
+def test_the_axis_of_the_scene_is_found_with_its_correction(offset: float) -> None:
+    found = _aligned(_scene(offset))
+    assert found.offset == pytest.approx(offset, abs=0.2)
+    assert found.axis_col == pytest.approx(79.5 + offset, abs=0.2)
+    assert found.offset_mm == pytest.approx(offset * 4.6e-3, abs=1e-3)
+    assert abs(found.lean) < 0.5 and found.detail > 0
+    axis, tilt, detail = found.lines()
+    assert ("right of the middle" in axis) is (offset > 0)
+    assert f"move the axis {abs(found.offset_mm):.4g} mm towards {'lower' if offset > 0 else 'higher'} columns" in axis
+    assert f"optics.axis_col={found.axis_col:.2f}" in axis
+    assert "no correction" in tilt and "px over which the view" in detail
+
+
+def test_an_axis_that_leans_is_turned_back_by_what_is_said() -> None:
+    leans = Alignment(79.5, 0.0, 0.0, math.radians(0.5), math.radians(0.05), 3.0, 0.0, 144)
+    axis, tilt, _ = leans.lines()
+    assert "move" not in axis
+    assert "1.25 px from first to last row; turn the axis 0.500° clockwise" in tilt
+    unknown = Alignment(79.5, 0.0, 0.0, math.nan, math.nan, math.nan, 0.0, 144)
+    assert "not known" in unknown.lines()[1] and "not known" in unknown.lines()[2]
+
+
+def test_the_second_view_stays_within_the_limits() -> None:
+    assert _aligned(_scene(1.0), math.radians(250)).offset == pytest.approx(1.0, abs=0.2)
+
+
+def test_views_without_contrast_are_refused_and_the_instrument_is_safe() -> None:
+    instrument = FakeInstrument()
+    with pytest.raises(QualityError, match="two views"):
+        align(small(), instrument.connected(), StopRequest(), lambda event: None)
+    assert_safe(instrument)
+
+
+def test_a_stop_is_taken() -> None:
+    stop = StopRequest()
+    instrument = FakeInstrument(on_frame=lambda number: stop.stop() if number == 5 else None)
+    with pytest.raises(ScanStopped):
+        align(small(), instrument.connected(), stop, lambda event: None)
+    assert_safe(instrument)
+
+
+DEMO = (
+    str(config_folder() / "demo.yaml"),
+    "--set",
+    "simulation.clock=virtual",
+    "--set",
+    "devices.camera.roi=[1140, 1968, 24, 160]",
+)
+
+
+def test_the_exposure_to_take_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = beamline("tune", *DEMO)
+    assert result.exit_code == 0, result.output
+    names = [line.split()[0] for line in result.stdout.splitlines()]
+    assert names == ["dark", "flat", "saturated", "photons", "view", "noise", "exposure"]
+    assert "scan.exposure_s=0.05" in result.stdout
+    assert list(tmp_path.iterdir()) == []  # nothing is written
+
+
+def test_references_that_would_stop_a_scan_end_with_6() -> None:
+    result = beamline("tune", *DEMO, "--set", "scan.exposure_s=0.095", "--angle", "30", "--json")
+    assert result.exit_code == 6
+    done = json.loads(result.stdout.splitlines()[-1])
+    assert done["event"] == "done" and done["saturated"] > 0.9 and 0.04 < done["advised"] < 0.07
+    assert "0.05" in result.stderr.splitlines()[-1]

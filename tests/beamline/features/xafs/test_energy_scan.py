@@ -14,7 +14,7 @@ from beamline.features.xafs.contrast import find_edge
 from beamline.features.xafs.energy_scan import open_energy_scan
 from beamline.features.xafs.series import run_series
 from drivers.base.clock import SystemClock
-from simulators.samples.materials.palette import palette_of
+from simulators.samples.materials.materials import palette_of
 
 SCENE: dict[str, Any] = {
     "phantom": {

@@ -12,7 +12,7 @@ import recon
 from beamline.core.errors import DataError
 from beamline.projections.corrections.air import without_background
 from recon.base.geometry import Geometry
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 

@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.features.models.command import write_mesh
 from beamline.storage.meshes.reading import read_mesh
 from recon.features.surfaces.marching import Mesh
-from tests.simulators.samples.voxels.test_mesh import sphere
+from tests.simulators.samples.voxels.test_files import sphere
 
 TEXT = {
     "a.stl": "solid a\n facet normal 0 0 1\n  outer loop\n   vertex 0 0 0\n   vertex 1 0 0\n   vertex 0 2 0\n"

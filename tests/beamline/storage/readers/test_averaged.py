@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError
 from beamline.monitor.checks import ALARM_SHIFT
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.averaged import JOINED_DEG, AveragedSource
+from beamline.storage.readers.changed import JOINED_DEG, AveragedSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.wrapped import CroppedSource
 from drivers.base.frame import FrameKind

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -100,20 +98,6 @@ def test_a_broken_link_to_angles_or_to_a_dataset_by_its_name_is_named(tmp_path: 
             open_scan(SourceOptions(path, data_path=data, angles=ANGLES))
     with pytest.raises(DataError, match="exchange/none"):
         open_scan(SourceOptions(path, data_path="exchange/none", angles=ANGLES))
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="a program of its own holds the lock, with another message there")
-def test_a_file_that_another_program_writes_is_said_to_be_locked(tmp_path: Path) -> None:
-    path = two_detectors(tmp_path / "s.nx")
-    program = f"import h5py\nwith h5py.File({str(path)!r}, 'r+'):\n    print('open', flush=True)\n    input()"
-    with subprocess.Popen(
-        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as other:
-        assert other.stdout is not None and other.stdout.readline() == "open\n"
-        with pytest.raises(DataError, match=r"by another program.*HDF5_USE_FILE_LOCKING"):
-            open_scan(path)
-        other.communicate("\n")
-    open_scan(SourceOptions(path, data_path="/entry/instrument/camera1/data")).close()
 
 
 @pytest.mark.parametrize("number", [37, 38, 95])

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stated import EXCHANGE, NXTOMO, Entry

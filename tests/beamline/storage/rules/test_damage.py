@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.storage.recover import recover
 from drivers.base.frame import Frame
 from tests.beamline.scans import TwoCylinders, write_exchange

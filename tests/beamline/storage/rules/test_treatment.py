@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import validate
+from beamline.features.files.validate import describe, validate
 from beamline.monitor.check import Flag, Level
 from beamline.projections.usable_views import usable_views
 from beamline.storage.flag_legend import FrameFlags

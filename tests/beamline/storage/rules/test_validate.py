@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.text import spans
-from beamline.features.files.describe import describe
-from beamline.features.files.validate import source_findings, validate
+from beamline.features.files.validate import describe, source_findings, validate
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource

@@ -13,15 +13,17 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import h5py
 import pytest
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
+from beamline.storage import disk_file
 from beamline.storage.overlay import Overlay
 from beamline.storage.readers.open import open_scan
-from beamline.storage.writers import layout, nxtomo, to_disk
+from beamline.storage.writers import layout, nxtomo
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.rows import Rows
 from drivers.base.frame import Frame
@@ -35,8 +37,7 @@ def test_a_full_disk_is_named_and_earlier_rows_stay(
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
 
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    full = Mock(side_effect=OSError(28, "No space left on device"))
 
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
@@ -67,8 +68,7 @@ def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_
     for frame in frames[:2]:
         writer.append(frame, digest(frame.counts))
 
-    def full(*_: object) -> None:
-        raise no_room()
+    full = Mock(side_effect=no_room())
 
     with monkeypatch.context() as patch:
         patch.setattr(Rows, "write", full)
@@ -97,8 +97,7 @@ def test_a_disk_that_is_full_when_the_scan_ends_is_named(
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
 
-    def full(*_: object) -> None:
-        raise no_room()
+    full = Mock(side_effect=no_room())
 
     with monkeypatch.context() as patch:
         patch.setattr(h5py.File, "flush", full)
@@ -152,8 +151,7 @@ def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
 def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
     tmp_path: Path, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise no_room()
+    full = Mock(side_effect=no_room())
 
     monkeypatch.setattr(layout, "create", full)
     with pytest.raises(DataError, match=r"s\.h5 cannot be created \(No space left on device\)"):
@@ -171,7 +169,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
         begun.set()
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
         handle = writer._file.id.get_vfd_handle()
         for frame in frames:
@@ -193,7 +191,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
             raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     with pytest.raises(DataError, match=r"take the frame .*Input/output error.*first 3 frames"):
         for frame in frames:
@@ -215,7 +213,7 @@ def test_a_disk_that_hangs_does_not_hold_the_writer(
         hangs.wait(10.0)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
+    monkeypatch.setattr(disk_file, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     for frame in frames:
         writer.append(frame, digest(frame.counts))
@@ -226,18 +224,14 @@ def test_a_disk_that_hangs_does_not_hold_the_writer(
 
 
 def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fsync(handle: int) -> None:
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    to_disk.to_disk(0)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EINVAL, "Invalid argument")))
+    disk_file.to_disk(0)
 
 
 def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
     tmp_path: Path, clock: SteppedClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    full = Mock(side_effect=OSError(28, "No space left on device"))
 
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=9)
     for frame in frames[:3]:

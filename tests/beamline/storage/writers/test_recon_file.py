@@ -1,4 +1,4 @@
-"""Reconstruction files: whole or absent, never overwritten, and everything comes back."""
+"""Reconstruction files and checkpoints: whole or absent, never overwritten unless asked, and everything comes back."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
-from beamline.storage.writers import recon_file
-from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction, write_reconstruction
+from beamline.storage.writers import recon_file as checkpoint_file
+from beamline.storage.writers.recon_file import (
+    Checkpoint,
+    ReconRecord,
+    read_checkpoint,
+    read_reconstruction,
+    write_checkpoint,
+    write_reconstruction,
+)
 from recon.base.volume import Grid, Volume
 
 
@@ -81,15 +89,6 @@ def test_everything_comes_back(
     assert (read.raw_file, read.title, read.sample, read.time) == ("scan.h5", "a test", "battery", written.time)
 
 
-def test_never_overwrites(tmp_path: Path) -> None:
-    path = tmp_path / "out.h5"
-    path.write_text("precious")
-    with pytest.raises(DataError, match="never overwritten"):
-        write_reconstruction(path, _record())
-    assert path.read_text() == "precious"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def test_refuses_a_file_that_appeared_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     with pytest.raises(DataError, match="never overwritten"), whole_file(path) as partial:
@@ -124,17 +123,6 @@ def test_a_file_that_the_system_does_not_let_go_of_is_left_as_it_is(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
-        entry["definition"] = "NXtomoproc"
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(recon_file, "write_entry", full_disk)
-    with pytest.raises(DataError, match="No space left"):
-        write_reconstruction(tmp_path / "out.h5", _record())
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not exist"):
         write_reconstruction(tmp_path / "no" / "out.h5", _record())
@@ -144,8 +132,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.h5").write_text("no HDF5")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["entry/data/data"] = np.zeros((2, 2, 2))
-    for name in ("text.h5", "other.h5", "missing.h5"):
-        with pytest.raises(DataError, match="as a reconstruction"):
+    refused = {"text.h5": "as a reconstruction", "other.h5": "as a reconstruction", "missing.h5": "is not there"}
+    for name, said in refused.items():
+        with pytest.raises(DataError, match=said):
             read_reconstruction(tmp_path / name)
 
 
@@ -168,3 +157,82 @@ def test_slices_that_are_higher_than_pixels_are_wide_stay_so(tmp_path: Path) -> 
     grid = Grid((3, 4, 4), 0.02, slice_pitch=0.05)
     write_reconstruction(tmp_path / "v.h5", replace(record, volume=Volume(record.volume.data, grid)))
     assert read_reconstruction(tmp_path / "v.h5").volume.grid.spacing == pytest.approx((0.05, 0.02, 0.02))
+
+
+KEPT = Checkpoint(
+    {"parameters.raw": np.arange(4, dtype=np.float32), "generator": np.array([2**64 - 1, 3], np.uint64)},
+    {"projections": "ab12", "n_views": 30, "pixel_pitch": np.asarray(0.5), "angles": np.linspace(0, 3, 30)},
+    500,
+)
+
+
+@given(
+    hnp.arrays(st.sampled_from([np.float32, np.int64, np.uint64]), hnp.array_shapes(max_dims=2, max_side=4)),
+    st.integers(0, 10**9),
+)
+def test_there_and_back_to_the_bit(tmp_path_factory: pytest.TempPathFactory, values: np.ndarray, steps: int) -> None:
+    path = tmp_path_factory.mktemp("kept") / "fit.h5"
+    write_checkpoint(path, Checkpoint({"a": values, "none": np.empty(0, np.int64)}, KEPT.made_from, steps))
+    back = read_checkpoint(path)
+    assert back.state["a"].dtype == values.dtype and back.state["a"].tobytes() == values.tobytes()
+    assert back.state["none"].shape == (0,) and back.steps == steps
+    assert back.made_from["projections"] == "ab12" and back.made_from["n_views"] == 30
+    np.testing.assert_array_equal(back.made_from["angles"], KEPT.made_from["angles"])
+
+
+def test_the_new_one_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path / "fit.h5", KEPT)
+    write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
+    assert read_checkpoint(tmp_path / "fit.h5").steps == 7
+    assert [p.name for p in tmp_path.iterdir()] == ["fit.h5"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_one_that_fails_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    write_checkpoint(tmp_path / "fit.h5", KEPT)
+
+    def fails() -> str:
+        raise error
+
+    monkeypatch.setattr(checkpoint_file, "version", fails)
+    with pytest.raises((DataError, KeyboardInterrupt)):
+        write_checkpoint(tmp_path / "fit.h5", Checkpoint({}, {}, 7))
+    assert read_checkpoint(tmp_path / "fit.h5").steps == 500
+    assert [p.name for p in tmp_path.iterdir()] == ["fit.h5"]
+
+
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.h5").write_text("words")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["volume"] = 1
+    with h5py.File(tmp_path / "half.h5", "w") as file:
+        file.attrs["format"] = "splatline checkpoint 1"
+    for name in ("missing.h5", "text.h5", "other.h5", "half.h5"):
+        with pytest.raises(DataError, match=name):
+            read_checkpoint(tmp_path / name)
+
+
+def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_checkpoint(tmp_path / "fit.h5", KEPT)
+    whole, refused = (tmp_path / "fit.h5").read_bytes(), 0
+    with h5py.File(tmp_path / "fit.h5") as file:
+        in_values = [file[f"{name}"].id.get_offset() for name in ("state/parameters.raw", "made_from/angles")]
+    for at in [*in_values, *rng.integers(len(whole), size=200).tolist()]:
+        flipped = bytearray(whole)
+        flipped[at] ^= 1 << int(rng.integers(8))
+        (tmp_path / "flipped.h5").write_bytes(flipped)
+        try:
+            back = read_checkpoint(tmp_path / "flipped.h5")
+        except DataError as error:
+            refused += 1
+            assert "flipped.h5" in str(error)
+            continue
+        assert at not in in_values
+        assert back.steps == KEPT.steps and back.state.keys() == KEPT.state.keys()
+        for name, values in KEPT.state.items():
+            np.testing.assert_array_equal(back.state[name], values)
+        for name, value in KEPT.made_from.items():
+            np.testing.assert_array_equal(back.made_from[name], value)
+    assert refused > 2

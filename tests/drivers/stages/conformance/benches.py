@@ -15,10 +15,11 @@ from drivers.testing.stages import Build, StageBench, StageKind
 from simulators.wires.serial_url import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.stages import pi_gcs_rig
-from tests.drivers.stages.rigs import AnyRig
+from tests.drivers.stages.rig import NAMES, StageRig
+from tests.drivers.stages.rigs import pi_gcs
 from tests.simulators.wires.transports import serve_pty
 
-RigOf = Callable[[dict[str, Any]], AnyRig]
+RigOf = Callable[[dict[str, Any]], StageRig]
 """A fresh controller for a driver with these settings."""
 
 
@@ -49,18 +50,13 @@ class Kind(StageKind):
         return build
 
 
-def _slow_pm16c(settings: dict[str, Any]) -> AnyRig:
+def _slow_pm16c(settings: dict[str, Any]) -> StageRig:
     rig = pm16c_rig.Rig(home_at=500)
-    rig.url = register(next(pm16c_rig.NAMES), pm16c_rig.Slow(rig, 0.04))
+    rig.url = register(next(NAMES), pm16c_rig.Slow(rig, 0.04))
     return rig
 
 
-def _pi_gcs(settings: dict[str, Any]) -> AnyRig:
-    """Without latency: on a real terminal the virtual clock stands while a reply is on its way."""
-    return pi_gcs_rig.Rig(wire={"latency": 0.0})
-
-
-def _pi_gcs_by_limit_switch(settings: dict[str, Any]) -> AnyRig:
+def _pi_gcs_by_limit_switch(settings: dict[str, Any]) -> StageRig:
     """Another axis, reference by the negative limit switch, a servo that looks once in 50 µs and no ACC and DEC."""
     wire = {"axis": "ROT_A", "output": 1, "latency": 0.0, "unknown": {"ACC", "DEC"}}
     return pi_gcs_rig.Rig(wire=wire, low=-5.0, reference_switch=False, servo_period=50e-6)
@@ -78,7 +74,7 @@ _PM16C = Kind(
     turning_back_ends=False,
     disarms_moving=False,
 )
-_PI_GCS = Kind(rig=_pi_gcs, usual={}, width=None, inverts=True)
+_PI_GCS = Kind(rig=lambda _: pi_gcs(), usual={}, width=None, inverts=True)
 _ZABER = Kind(rig=_zaber(), usual={}, width=1e-3, no_width=0.5e-3, inverts=True)
 KINDS = {
     "pm16c": _PM16C,

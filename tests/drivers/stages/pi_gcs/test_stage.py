@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import RotationStage
-from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.settings import StageFigures
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
-from tests.drivers.stages.pi_gcs_rig import COUNTS, NAMES, Rig
+from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
+from tests.drivers.stages.rig import NAMES
 
 
 @pytest.fixture
@@ -75,13 +73,6 @@ def test_counts_that_are_whole_counts_of_the_controllers_will_do(rig: Rig) -> No
     rig.open().close()
 
 
-def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
-    rig = Rig(low=-4.0, high=1e9)
-    with pytest.raises(DeviceRefused, match=re.escape("limited to -4.0000 deg to 1000000000.0000 deg")):
-        rig.open()
-    rig.open(low=math.radians(-4)).close()
-
-
 @pytest.mark.parametrize("vast", ["1.79769e+308", f"{1.7e308:.6f}"])
 def test_the_limits_of_an_endless_stage_may_be_as_large_as_numbers_are(rig: Rig, vast: str) -> None:
     rig.spoil = lambda reply: reply.replace(b"720.000000", vast.encode())
@@ -104,12 +95,6 @@ def test_another_controller_on_the_port_is_named(rig: Rig, spoilt: tuple[bytes, 
         rig.open()
     rig.spoil = lambda reply: reply
     rig.open().close()
-
-
-def test_limits_are_what_was_configured(rig: Rig) -> None:
-    stage = rig.open()
-    figures = StageFigures(COUNTS, math.radians(30), math.radians(60), math.radians(-5), math.radians(100))
-    assert stage.limits == PiGcsSettings(figures).limits()
 
 
 def test_a_transcript_has_the_dialogue(rig: Rig, tmp_path: Path) -> None:

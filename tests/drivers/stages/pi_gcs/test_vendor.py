@@ -15,7 +15,9 @@ import pytest
 from drivers.base.clock import SystemClock
 from drivers.testing.stages.bench import emitted
 from simulators.devices.trigger_line import TriggerLine
-from tests.drivers.stages.pi_gcs_rig import controller
+from simulators.wires.pi_gcs.wire import PiGcsBuild
+from tests.drivers.stages.flat_settings import flat
+from tests.drivers.stages.pi_gcs_rig import CABLE
 from tests.simulators.wires.transports import serve_pty
 
 pytest.importorskip("pipython", reason="PIPython, the vendor's host library (Python 3.12 or newer), is not installed")
@@ -49,7 +51,7 @@ def bench() -> Iterator[Bench]:
 
     clock = SystemClock()
     line = TriggerLine(clock)
-    box = controller(clock, line, referenced=False, found_at=1.0)
+    box = flat(PiGcsBuild, **CABLE, latency=0.002, referenced=False, found_at=1.0).controller(clock, line)
     # Left without its context, that library's device is called again when the next one connects.
     with (
         serve_pty(box) as url,

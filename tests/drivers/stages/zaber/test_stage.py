@@ -17,7 +17,8 @@ from drivers.stages.zaber.settings import ZaberSettings
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
 from simulators.wires.zaber.wire import Fault
-from tests.drivers.zaber_rig import NAMES, REPLIES_TO_OPEN, Rig
+from tests.drivers.stages.rig import NAMES
+from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
 
 
 @pytest.fixture
@@ -64,14 +65,6 @@ def test_a_real_stages_turn_is_checked() -> None:
     assert stage.limits.counts_per_turn == 384_000
 
 
-def test_limits_in_the_controller_that_leave_no_room_are_respected() -> None:
-    rig = Rig(low=-8000, high=80_000)
-    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
-        with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
-            rig.open(**limits)
-    rig.open(low=math.radians(-8), high=math.radians(80)).close()
-
-
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
@@ -107,15 +100,6 @@ def test_native_units_are_speed_times_a_factor_and_acceleration_ten_thousand_tim
     figures = StageFigures(384_000, math.radians(10), math.radians(100))
     assert ZaberSettings(figures).native_limits == (17_476, 17)
     assert ZaberSettings(figures, speed_unit=1.0).native_limits == (10_667, 10)
-
-
-def test_the_acceleration_that_the_stage_names_is_the_one_that_it_has(rig: Rig) -> None:
-    stage = rig.open()
-    assert 0.9 * math.radians(60) < stage.limits.acceleration <= math.radians(60)
-    stage.start_move(math.radians(60), math.radians(30))
-    begun = rig.clock.now()
-    rig.clock.sleep(0.25)
-    assert rig.line.angle_at(begun + 0.25) == pytest.approx(0.5 * stage.limits.acceleration * 0.25**2, rel=1e-9)
 
 
 # references and faults

@@ -15,7 +15,7 @@ from recon.features.calibration.background import LearntBackground, learn_backgr
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 

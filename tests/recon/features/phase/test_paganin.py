@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.base.units import HC
 from recon.features.phase.paganin import Paganin, length_of
 from simulators.effects.scattering.phase_fringes import PhaseFringes
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Ellipsoid
 from tests.simulators import shots

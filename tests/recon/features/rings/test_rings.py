@@ -20,7 +20,7 @@ from recon.features.rings.rings import (
     without_dead_columns,
     without_large_stripes,
 )
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
 from tests.recon.prep.real_views import tooth_views

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.features.rings.rings import REMOVERS, width_for
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
 from tests.recon.prep.real_views import tooth_views

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from simulators.effects.beam.open_beam import BeamBend, BlackBand, LostBeam, NarrowField, RingCurrent
 from simulators.effects.chain import Label
 from simulators.frame import sensor
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from tests.simulators import anomalies, shots
 
 BEND = BeamBend(curvature=(0.04, -0.02), level=-0.01, drift=1e-4)

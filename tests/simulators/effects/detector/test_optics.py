@@ -15,8 +15,7 @@ from scipy.ndimage import gaussian_filter
 
 from simulators.effects.detector.optics import Afterglow, FlatStructure, ScintillatorBlur, discrete_gaussian, gauss_rule
 from simulators.frame import sensor
-from simulators.frame.detector import Detector
-from simulators.frame.shot import Moments, Shot, fixed_rng
+from simulators.frame.shot import Detector, Moments, Shot, fixed_rng
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]

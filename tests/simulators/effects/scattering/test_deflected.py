@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter
 from simulators.effects.chain import VISIBLE
 from simulators.effects.scattering.deflected import Crumb, Floaters, Scatter
 from simulators.frame import sensor
-from simulators.frame.detector import Detector
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Shot
 from tests.simulators import anomalies, shots
 
 ONE = {"kind": "floaters", "distance": [0.7, 0.7], "count": 1, "size": [0.02, 0.02], "depth": 1.0, "seed": 5}

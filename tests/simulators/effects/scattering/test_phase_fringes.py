@@ -14,8 +14,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import fresnel
 
 from simulators.effects.scattering.phase_fringes import HC, PhaseFringes
-from simulators.frame.detector import Detector
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Shot
 from tests.simulators import shots
 
 Reals = NDArray[np.float64]

@@ -16,9 +16,7 @@ from simulators.devices.motion import TrapezoidMove
 from simulators.devices.motor import PulseMotor
 from simulators.effects.chain import Label
 from simulators.effects.stage.errors import EncoderError, Jump, Runout, StageWobble, came_forwards, series
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
-from simulators.frame.shot import Shot
+from simulators.frame.shot import Detector, Pose, Shot
 from tests.simulators import shots
 from tests.simulators.poses import posed, seen
 

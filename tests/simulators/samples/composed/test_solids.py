@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import load_scene
 

@@ -1,14 +1,31 @@
-"""Materials: the tables themselves, published values of others, and mixtures by hand."""
+"""Materials: tables, edges, and the names of a palette."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 import xraylib
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from simulators.samples.materials.materials import Material, by_mass, by_volume, layered_oxide, of_formula
+from simulators.frame.mapping import SceneError
+from simulators.samples.materials.materials import (
+    FAR,
+    K_EDGES,
+    NEAR,
+    Material,
+    by_mass,
+    by_volume,
+    known,
+    layered_oxide,
+    near_edge,
+    of_formula,
+    palette_of,
+    profile,
+)
 
 ENERGIES = np.array([2.0, 8.0, 8.5, 25.0, 60.0, 300.0])
 
@@ -108,3 +125,156 @@ def test_unknown_formulas_and_untabulated_energies_are_refused() -> None:
         of_formula("it", "Xx2O", 1.0)
     with pytest.raises(ValueError, match=r"from 0.1 to 800"):
         of_formula("it", "Al", 2.7).attenuation([8.0, 900.0])
+
+
+Reals = NDArray[np.float64]
+Z = sorted(K_EDGES)
+
+
+def _table(z: int, energies: Reals) -> Reals:
+    return np.array([xraylib.CS_Total(z, float(e)) for e in energies])
+
+
+def _edge(z: int) -> float:
+    return float(xraylib.EdgeEnergy(z, xraylib.K_SHELL))
+
+
+def _near(z: int, energies: Reals, charge: float = 1.0) -> Reals:
+    width = xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3
+    return near_edge(energies, lambda e: _table(z, e), _edge(z), width, K_EDGES[z], charge)
+
+
+@pytest.mark.parametrize(("z", "kev"), [(25, 6.539), (27, 7.709), (28, 8.333)])
+def test_edges_are_where_the_tables_have_them(z: int, kev: float) -> None:
+    """Bearden & Burr, Rev. Mod. Phys. 39, 125, 1967: Mn 6539.0, Co 7708.9, Ni 8332.8 eV."""
+    assert _edge(z) == pytest.approx(kev, abs=2.5e-4)
+
+
+@pytest.mark.parametrize(("z", "ev"), [(25, 1.11), (27, 1.28), (28, 1.39)])
+def test_core_holes_are_as_wide_as_the_source_has_them(z: int, ev: float) -> None:
+    """Campbell & Papp 2001; Krause & Oliver 1979 have 0.05 eV more, which nothing here would show."""
+    assert xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3 == pytest.approx(ev, abs=0.005)
+
+
+@pytest.mark.parametrize("z", Z)
+@pytest.mark.parametrize("charge", [0.0, 1.0])
+def test_the_jump_is_the_table_s(z: int, charge: float) -> None:
+    """From far below to far above, to the last bit; across 1e-6 of it is asked for."""
+    for away in (FAR, 200.0, 1000.0):
+        around = _edge(z) + np.array([-away, away]) * 1e-3
+        jump, expected = np.diff(_near(z, around, charge))[0], np.diff(_table(z, around))[0]
+        assert jump == pytest.approx(expected, rel=1e-6)
+        assert jump > 0
+
+
+@pytest.mark.parametrize("z", Z)
+def test_near_the_edge_it_is_the_form_times_the_jump(z: int) -> None:
+    """Less what the white line and the tails of the arctangent put there, the table is left, on either side."""
+    width = xraylib.AtomicLevelWidth(z, xraylib.K_SHELL) * 1e3
+    away = np.array([-NEAR, -40.0, -20.0, -5.0, 5.0, 20.0, 40.0, NEAR])
+    energies = _edge(z) + away * 1e-3
+    f = profile((energies - K_EDGES[z].white_line) * 1e3, width, K_EDGES[z])
+    jump = _table(z, np.array([_edge(z) + 1e-3]))[0] - _table(z, np.array([_edge(z) - 1e-3]))[0]
+    expected = _table(z, energies) + (f - (away > 0)) * jump * (energies / _edge(z)) ** -2.8
+    np.testing.assert_allclose(_near(z, energies), expected, atol=1e-3 * jump)
+
+
+@pytest.mark.parametrize("z", Z)
+def test_the_white_line_is_where_it_is_said_and_moves_with_the_charge(z: int) -> None:
+    fine = _edge(z) + np.arange(0, 0.05, 2e-6)
+    tops = [float(fine[np.argmax(_near(z, fine, charge))]) for charge in (0.0, 0.25, 1.0)]
+    assert tops[2] == pytest.approx(K_EDGES[z].white_line, abs=5e-5)  # the arctangent still rises under it
+    np.testing.assert_allclose(np.subtract(tops[2], tops[:2]) * 1e3, np.array([1, 0.75]) * K_EDGES[z].shift, atol=5e-3)
+
+
+def test_the_rise_is_as_wide_as_the_core_hole() -> None:
+    """Of an arctangent with full width Γ, half the rise lies within Γ of energy."""
+    shape = K_EDGES[28]
+    x = np.array([-0.7, 0.7]) - shape.below
+    without_line = profile(x, 1.4, shape) - shape.height / (1 + (x / (shape.width / 2)) ** 2)
+    np.testing.assert_allclose(without_line, [0.25, 0.75], atol=1e-12)
+
+
+@pytest.mark.parametrize("z", Z)
+def test_the_table_takes_over_without_a_step(z: int) -> None:
+    """The tails of the form, a thousandth of the jump at 150 eV, are gone by there."""
+    for away in (-FAR, FAR):
+        low, high = _near(z, _edge(z) + np.array([away - 0.01, away + 0.01]) * 1e-3)
+        assert abs(high - low) < 2e-5 * 400  # 0.02 eV of the table's own fall
+
+
+@given(away=st.floats(-400, 400), charge=st.floats(0, 1))
+def test_there_is_no_step_left_and_no_negative_matter(away: float, charge: float) -> None:
+    around = _edge(28) + np.array([away, away + 0.01]) * 1e-3
+    low, high = _near(28, around, charge)
+    assert low > 0 and high > 0
+    assert abs(high - low) < 0.01 * 0.7 * 285  # 10 meV: the steepest rise is 1/(π Γ/2) + the line's, of a jump of 285
+
+
+# Densities as sold or as measured on crystals, in g/cm3, to a few per cent.
+DENSITIES = {
+    "LiCoO2": 5.05, "NMC111": 4.77, "NMC532": 4.77, "NMC622": 4.77, "NMC811": 4.78, "graphite": 2.26, "Al": 2.70,
+    "Cu": 8.96, "Si": 2.33, "Ni": 8.90, "steel": 7.86, "stainless_steel": 8.0, "electrolyte": 1.30,
+    "polypropylene": 0.90, "polyethylene": 0.93, "separator": 1.06, "water": 1.0, "air": 1.2e-3, "PVDF": 1.78,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "density"), DENSITIES.items(), ids=DENSITIES)
+def test_a_known_material_needs_only_its_name(name: str, density: float) -> None:
+    material = palette_of("materials", None)(name)
+    assert material.name == name
+    assert material.density == pytest.approx(density, rel=0.01)
+    assert sum(share for _, share in material.fractions) == pytest.approx(1.0, abs=1e-5)
+    assert (np.diff(material.attenuation([10.0, 20.0, 40.0])) < 0).all()
+
+
+def test_the_digits_of_an_nmc_are_its_metals() -> None:
+    shares = dict(palette_of("materials", None)("NMC622").fractions)
+    moles = np.array([shares[28] / 58.693, shares[25] / 54.938, shares[27] / 58.933])
+    np.testing.assert_allclose(moles / moles.sum(), [0.6, 0.2, 0.2], rtol=1e-4)
+    assert 25 not in dict(palette_of("materials", None)("NMC901").fractions)
+    assert known("NMC000") is None and known("NMC12") is None
+
+
+def test_the_electrolyte_is_one_molar() -> None:
+    """Of one litre, 1300 g, 31 g are phosphorus."""
+    shares = dict(palette_of("materials", None)("electrolyte").fractions)
+    assert shares[15] == pytest.approx(30.97 / 1300, rel=1e-3)
+
+
+def test_a_scene_changes_and_adds_materials() -> None:
+    colours = palette_of(
+        "materials",
+        {"NMC811": {"state_of_charge": 0.5, "edge_shift_ev": 3.0}, "coating": {"formula": "Al2O3", "density": 3.95},
+         "Al": {"density": 1.35}},
+    )  # fmt: skip
+    assert (colours("NMC811").state_of_charge, colours("NMC811").edge_shift_ev) == (0.5, 3.0)
+    assert colours("NMC622").state_of_charge is None
+    assert colours("Al").attenuation(20.0) == pytest.approx(0.1 * 1.35 * 3.442, rel=1e-3)  # NIST
+    shares = dict(colours("coating").fractions)
+    assert shares[13] == pytest.approx(2 * 26.98 / 101.96, rel=1e-3)
+    np.testing.assert_array_equal(colours.filters("Al")(20.0), colours("Al").attenuation(20.0))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ([], r"materials must be a mapping from names to the properties of materials; got \[\]"),
+        ({"NMC811": 3}, "materials.NMC811 must be a mapping"),
+        ({"NMC811": {"charge": 1}}, "materials.NMC811: key 'charge' is unknown; legal: formula, density, state_of"),
+        ({"NMC811": {"state_of_charge": 2}}, "materials.NMC811: NMC811: state_of_charge must lie in 0 ... 1, got 2.0"),
+        ({"Al": {"state_of_charge": 1}}, "this has none of them"),
+        ({"glue": {"density": 1.1}}, "materials.glue: 'glue' is not a known material; give formula and density"),
+        ({"glue": {"formula": "C2H4"}}, "materials.glue: 'glue' is not a known material; give formula and density"),
+        ({"glue": {"formula": "Qq", "density": 1}}, "materials.glue: Invalid chemical formula"),
+        ({"glue": {"formula": "C", "density": -1}}, "density must lie between 0 and 100"),
+    ],
+)
+def test_an_impossible_material_is_refused(entry: Any, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        palette_of("materials", entry)
+
+
+def test_an_unknown_name_is_told_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"'mud'.*NMC"):
+        palette_of("materials", {"glue": {"formula": "C2H4", "density": 1.1}})("mud")

@@ -1,25 +1,33 @@
-"""Parts: contrasts, one energy as the plain path to the bit, and a mixture's depth and truth."""
+"""Parts: solids of materials, the sample that they form, and what a beam of many energies sees of it."""
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
+from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.light.beam import Tube as XrayTube
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
-from simulators.samples.materials.materials import of_formula
-from simulators.samples.materials.parts import Mixture, Part, sample_of
-from simulators.samples.materials.spectrum import Attenuation
+from simulators.samples.materials.materials import of_formula, palette_of
+from simulators.samples.materials.parts import Mixture, Part, effective_depth, sample_of
+from simulators.samples.materials.spectrum import Attenuation, Spectrum
 from simulators.samples.sample import Sample
+from simulators.scenes.scene import load_scene
 
 LIQUID, OXIDE = of_formula("liquid", "C3H6O3", 1.3), of_formula("oxide", "LiCoO2", 5.05)
 BATH = Cylinder(0.1, 0.3, 1.0)
@@ -132,3 +140,127 @@ def test_materials_are_refused_in_a_beam_without_energies_or_of_impossible_ones(
         _seen(PARTS, energy_kev=900.0)
     with pytest.raises(ValueError, match="instead_of 'liquid'"):
         Part(BATH, instead_of=LIQUID)
+
+
+POOL = {"kind": "cylinder", "radius": 0.1, "height": 0.3, "material": "electrolyte"}
+OXIDE_GRAIN = {
+    "kind": "ellipsoid", "semi_axes": [0.01, 0.01, 0.01], "material": "NMC811", "instead_of": "electrolyte",
+    "name": "active",
+}  # fmt: skip
+GREY = {"kind": "box", "edges": [0.1, 0.02, 0.1], "attenuation": 2.0, "name": "wall"}
+
+
+def _sample(*solids: Any, materials: Any = None, **light: Any) -> Sample:
+    phantom = {"kind": "solids", "solids": list(solids)} | ({} if materials is None else {"materials": materials})
+    return load_scene({"phantom": phantom, "beam": {"photons_per_s": 1.0} | light}).sample
+
+
+def test_a_scene_s_grain_stands_out_by_its_contrast() -> None:
+    charged = {"NMC811": {"state_of_charge": 1.0}}
+    sample = _sample(POOL, OXIDE_GRAIN, GREY, materials=charged, energy_kev=8.3485)
+    assert sample.names == ("electrolyte", "active", "wall")
+    centre = sample.line_integrals(0.0, Detector.centred((1, 1), 0.01))[0, 0]
+    colours = palette_of("", charged)
+    oxide, bath = (float(colours(name).attenuation(8.3485)) for name in ("NMC811", "electrolyte"))
+    assert centre == pytest.approx(0.2 * bath + 0.02 * (oxide - bath) + 0.02 * 2.0)
+
+
+def test_a_tube_s_filters_may_be_the_scene_s_own_materials() -> None:
+    tube = {"tube": {"kv": 40, "filters": {"foil": 0.5}}}
+    hard = _sample(POOL, materials={"foil": {"formula": "Cu", "density": 8.96}}, **tube)
+    soft = _sample(POOL, materials={"foil": {"formula": "C", "density": 0.1}}, **tube)
+    at = Detector.centred((1, 1), 0.01)
+    assert 0 < hard.line_integrals(0.0, at)[0, 0] < 0.2 * soft.line_integrals(0.0, at)[0, 0]
+
+
+def test_tables_are_loaded_only_where_a_material_is_named() -> None:
+    code = (
+        "import sys; from simulators.scenes.scene import load_scene; solid = {'kind': 'box', 'edges': [1, 1, 1]};"
+        "load_scene({'phantom': {'kind': 'solids', 'solids': [solid | {'attenuation': 1}]}, 'beam': "
+        "{'photons_per_s': 1, 'energy_kev': 8}}); assert 'xraylib' not in sys.modules;"
+        "load_scene({'phantom': {'kind': 'solids', 'solids': [solid | {'material': 'Al'}]}, 'beam': "
+        "{'photons_per_s': 1, 'energy_kev': 8}}); assert 'xraylib' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("solids", "light", "words"),
+    [
+        ([POOL], {}, r"scene.phantom \(solids\): materials need the beam's energy"),
+        (
+            [POOL | {"attenuation": 1.0}],
+            {"energy_kev": 8},
+            r"solids\[0\]: attenuation and material exclude each other",
+        ),
+        ([POOL, GREY | {"material": "mud"}], {"energy_kev": 8}, r"solids\[1\]: attenuation and material"),
+        ([POOL | {"material": "mud"}], {"energy_kev": 8}, r"solids\[0\]: material 'mud' is unknown"),
+        ([POOL | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
+        ([POOL, GREY | {"instead_of": "Al"}], {"energy_kev": 8}, "instead_of 'Al' needs a material"),
+        ([POOL, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\): key 'edges' is missing"),
+        ([POOL | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\): key 'colour' is unknown"),
+        ([POOL], {"energy_kev": 900}, "tabulated from 0.1 to 800 keV"),
+        (
+            [POOL],
+            {"tube": {"kv": 60, "filters": {"mud": 1}}},
+            r"scene.phantom \(solids\): material 'mud' is unknown",
+        ),
+    ],
+)
+def test_what_cannot_be_seen_is_refused(solids: list[Any], light: dict[str, Any], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        _sample(*solids, **light)
+
+
+def test_a_name_alone_is_for_grey_solids_too() -> None:
+    sample = _sample(GREY, materials={})
+    assert sample.names == ("wall",)
+    assert np.ptp(sample.line_integrals(0.0, Detector.centred((1, 2), 0.01))) == 0
+
+
+Reals = NDArray[np.float64]
+
+
+def test_a_slab_in_two_energies_is_the_closed_form() -> None:
+    """-log(w exp(-a t) + (1-w) exp(-b t)): slope w a + (1-w) b where it is thin, and the harder of both in the end."""
+    spectrum = Spectrum.of([20.0, 30.0], [3.0, 1.0])
+    mu = np.array([[4.0], [1.0]])
+    t = np.geomspace(1e-6, 1e3, 50).reshape(1, 5, 10)
+    got = effective_depth(t, mu, spectrum.weights)
+    expected = -np.logaddexp(np.log(0.75) - 4 * t[0], np.log(0.25) - t[0])
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-13)  # of the open beam
+    assert got[0, 0] / t[0, 0, 0] == pytest.approx(0.75 * 4 + 0.25 * 1, rel=1e-5)
+    assert got[-1, -1] - 1.0 * t[0, -1, -1] == pytest.approx(-math.log(0.25))
+
+
+@given(
+    thickness=arrays(np.float64, (2, 3, 4), elements=st.floats(0, 50)),
+    mu=arrays(np.float64, (3, 2), elements=st.floats(-0.5, 60)),
+    weights=arrays(np.float64, 3, elements=st.floats(0.01, 1)),
+)
+def test_the_effective_depth_lies_between_the_least_and_the_mean(thickness: Reals, mu: Reals, weights: Reals) -> None:
+    """Jensen: light that is added up never looks deeper than the mean depth; matter of one attenuation is exact."""
+    weights = weights / weights.sum()
+    depths = np.tensordot(mu, thickness, 1)
+    got = effective_depth(thickness, mu, weights)
+    slack = 1e-9 * (1 + np.abs(depths).max())
+    assert (got <= np.tensordot(weights, depths, 1) + slack).all()
+    assert (got >= depths.min(axis=0) - slack).all()
+    same = effective_depth(thickness, np.repeat(mu[:1], 3, axis=0), weights)
+    np.testing.assert_allclose(same, depths[0], atol=slack)
+
+
+def test_air_is_exactly_nothing_and_no_matter_is_too_deep() -> None:
+    thickness = np.zeros((1, 2, 2))
+    thickness[0, 1] = 1e6
+    depth = effective_depth(thickness, np.array([[5.0], [4.0]]), np.array([0.3, 0.7]))
+    assert (depth[0] == 0).all() and np.isfinite(depth[1]).all()
+    gap = np.array([[[1.0, 0.0, 1.0]]])  # between matter, where weights sum up to 1 only to rounding
+    assert effective_depth(gap, np.ones((10, 1)), np.full(10, 0.1))[0, 1] == 0.0
+
+
+def test_many_rows_are_shared_out_and_come_out_the_same() -> None:
+    thickness = np.random.default_rng(0).uniform(0, 2, (2, 300, 301))  # more than threads are taken for
+    mu, weights = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([0.4, 0.6])
+    expected = -np.log(np.tensordot(weights, np.exp(-np.tensordot(mu, thickness, 1)), 1))
+    np.testing.assert_allclose(effective_depth(thickness, mu, weights), expected, rtol=1e-12)

@@ -12,8 +12,7 @@ from numba import config
 from scipy.ndimage import map_coordinates
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
-from simulators.frame.pose import Pose
+from simulators.frame.shot import Detector, Pose
 from simulators.samples.voxels.voxels import Voxels
 
 SHAPE, SPACING = (7, 9, 11), (0.05, 0.04, 0.03)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.scenes.emission.counts import AIR, TEFLON, WATER, NemaPhantom, Rod, Scanner, events
 
 DETECTOR = Detector.centred((4, 64), 1.0)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.simulators.pi_gcs_host import ACCELERATION, VELOCITY, Wire
 
@@ -53,16 +51,6 @@ def test_control_bytes_act_at_once_even_within_a_line(wire: Wire) -> None:
 def test_carriage_returns_case_and_empty_lines_do_not_matter(wire: Wire) -> None:
     assert wire.raw(b"\n\r\n  \nmov 1 2.5\r\nMov? 1\n") == b"1=2.500000\n"
     assert wire.ask("ERR?") == "0"
-
-
-@given(st.lists(st.integers(1, 9), max_size=14))
-def test_bytes_may_come_in_pieces_of_any_size(sizes: list[int]) -> None:
-    wire, data = Wire(), b"POS? 1\nCSV?\n\x05TRO?\n"
-    for size in sizes:
-        wire.box.receive(data[:size])
-        data = data[size:]
-    wire.box.receive(data)
-    assert wire.box.transmit() == b"1=0.000000\n2.0\n0\n1=0 \n2=0 \n3=0 \n4=0\n"
 
 
 def test_replies_take_their_time() -> None:

@@ -47,16 +47,6 @@ def test_positions_have_a_sign_and_at_least_seven_digits(wire: Wire) -> None:
     assert wire.ask("PS?0") == "+2147483647"
 
 
-@given(st.lists(st.integers(1, 9), max_size=12))
-def test_bytes_may_come_in_pieces_of_any_size(sizes: list[int]) -> None:
-    wire, data = Wire(), b"PS?0\r\nSTQ?\r\nSPD?0\r\n"
-    for size in sizes:
-        wire.box.receive(data[:size])
-        data = data[size:]
-    wire.box.receive(data)
-    assert wire.box.transmit() == b"+0000000\r\nR4\r\nHSPD\r\n"
-
-
 def test_a_line_without_its_end_is_not_answered_yet(wire: Wire) -> None:
     wire.box.receive(b"SPD?0\r")
     assert wire.box.transmit() == b""

@@ -69,16 +69,6 @@ def test_words_and_ids_out_of_bounds_are_refused(wire: Wire) -> None:
     assert wire.ask("/1 0 100 home") == "@01 0 RJ IDLE -- BADMESSAGEID"
 
 
-@given(st.lists(st.integers(1, 9), max_size=12))
-def test_bytes_may_come_in_pieces_of_any_size(sizes: list[int]) -> None:
-    wire, data = Wire(), b"/1 1 1\n/1 0 2 get version\r\n/1 1 3 get pos\r"
-    for size in sizes:
-        wire.box.receive(data[:size])
-        data = data[size:]
-    wire.box.receive(data)
-    assert wire.box.transmit() == b"@01 1 1 OK IDLE -- 0\r\n@01 0 2 OK IDLE -- 7.38\r\n@01 1 3 OK IDLE -- 0\r\n"
-
-
 @given(
     st.lists(st.binary(max_size=200) | st.text(string.printable, max_size=90).map(lambda text: b"/1 " + text.encode()))
 )

@@ -10,7 +10,7 @@ import recon
 from beamline.projections.corrections.beam_hardening.hardening import Hardening, curve_of
 from recon.base.geometry import Geometry
 from simulators.effects.beam.energies import BeamHardening
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Cylinder
 from tests.simulators import shots

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.storage.readers.images.image_names import angles_of, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.reference_files import load_images
+from beamline.storage.readers.supplied import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12

@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.images.image_names import kind_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.reference_files import load_images
+from beamline.storage.readers.supplied import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)

@@ -13,8 +13,8 @@ import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.features.files.describe import describe
 from beamline.features.files.ingest import ingest
+from beamline.features.files.validate import describe
 from beamline.projections.corrections.poses import PosesOfFile
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import prepare_projections

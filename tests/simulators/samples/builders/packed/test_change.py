@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.builders.packed.foam import Foam

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.builders.packed.foam import Foam, holes
 from simulators.samples.composed.phantoms import build_sample

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.detector import Detector
 from simulators.frame.mapping import SceneError
+from simulators.frame.shot import Detector
 from simulators.light.beam import Beam
 from simulators.samples.builders.packed.resolution import Resolution
 from simulators.samples.composed.phantoms import build_sample

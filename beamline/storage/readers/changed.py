@@ -1,19 +1,129 @@
-"""AveragedSource: a scan with several frames a view, read as if each view were one frame, the mean of these."""
+"""Scans that are read with changes: other angles or references in front, or several frames as one view."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices, read_known
+from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, frame_indices, read_known
+from beamline.storage.readers.supplied import assign
 from beamline.storage.readers.wrapped import WrappedSource
-from drivers.base.frame import FrameKind
+from drivers.base.frame import Frame, FrameKind
+
+
+class OverlaidSource(WrappedSource):
+    """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
+
+    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
+    """
+
+    def __init__(
+        self,
+        base: ScanSource,
+        *,
+        angles: NDArray[np.float64] | None = None,
+        angles_from: str = "",
+        of_views: bool = False,
+        darks: NDArray[Any] | None = None,
+        flats: NDArray[Any] | None = None,
+        quantity: Quantity | None = None,
+    ) -> None:
+        """Lay over `base`.
+
+        Args:
+            angles: radians, for `base` (see `angle_table.assign`); `angles_from` names them in errors.
+            of_views: the angles are those of projections alone.
+            darks, flats: [frame, row, col].
+
+        DataError where shapes or counts do not fit.
+        """
+        super().__init__(base)
+        self._replaced = {FrameKind.DARK: darks, FrameKind.FLAT: flats}
+        given = [(kind, images) for kind, images in self._replaced.items() if images is not None]
+        for kind, images in given:
+            if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
+                raise DataError(
+                    f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                    f"{base.shape} as in {base.path}."
+                )
+        # One dtype, as of one camera: references are measured like the frames, and averages of them are floats.
+        self.dtype = np.result_type(base.dtype, *(images.dtype for _, images in given))
+        blocks = [images.astype(self.dtype) for _, images in given]
+        self._front = np.concatenate(blocks) if blocks else np.empty((0, *base.shape), self.dtype)
+        self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
+        self._angles = None if angles is None else assign(base, angles, angles_from, of_views=of_views)
+        self._quantity = quantity
+        self._update()
+
+    def _update(self) -> None:
+        """Take over the present state of `base`; added references have no angles and exposures."""
+        base = self._base
+        keys = base.image_key.copy()
+        for kind, images in self._replaced.items():
+            if images is not None:
+                keys[keys == kind] = FrameKind.INVALID
+        self.image_key = np.concatenate([self._front_key, keys]).astype(np.int32)
+        self.angles = self.of_frames(base.angles if self._angles is None else self._angles)
+        self.exposures = self.of_frames(base.exposures)
+        has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
+        stated: Quantity = "counts" if has_both and base.quantity == "unknown" else base.quantity
+        self.quantity = self._quantity or stated
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        flags = self._base.flags
+        return None if flags is None else flags.after(len(self._front))
+
+    @property
+    def replaces(self) -> NDArray[np.int64] | None:
+        rows, n = self._base.replaces, len(self._front)
+        return None if rows is None else np.concatenate([np.full(n, -1), np.where(rows < 0, -1, rows + n)])
+
+    @property
+    def part_starts(self) -> NDArray[np.int64]:
+        """The parts of `base`, the first with the references in front; added flats hold for all parts."""
+        if self._replaced[FrameKind.FLAT] is not None:
+            return np.zeros(1, np.int64)
+        starts = self._base.part_starts
+        return np.where(starts > 0, starts + len(self._front), 0)
+
+    def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([np.full((len(self._front), *known.shape[1:]), np.nan), known])
+
+    @property
+    def altered(self) -> frozenset[int]:
+        return frozenset(row + len(self._front) for row in self._base.altered)
+
+    @property
+    def damaged(self) -> frozenset[int]:
+        return frozenset(row + len(self._front) for row in self._base.damaged)
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        n = len(self._front)
+        indices = frame_indices(frames, n + self._base.image_key.size)
+        front = indices < n
+        if not front.any():
+            return self._base.read(indices - n, rows).astype(self.dtype, copy=False)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        out[front] = self._front[indices[front], rows]
+        if not front.all():
+            out[~front] = self._base.read(indices[~front] - n, rows)
+        return out
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        """The frames from `first` on; those of `base` keep what their file knows about them."""
+        if len(self._front) or self.dtype != np.uint16:
+            return super().frames(first)
+        angles = self.angles
+        return (replace(frame, angle=float(angles[frame.index])) for frame in self._frames_of_base(first))
+
 
 JOINED_DEG = "frames_per_view_joined_deg"
 """Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
@@ -38,6 +148,8 @@ class AveragedSource(WrappedSource):
         self.dtype, self.numbers, self.frames_per_view = np.dtype(np.float32), None, n
         self._groups: list[list[int]] = []  # rows of base, by row of this source
         self._looked_at = 0  # rows of base that belong to a group, or to none
+        if base.plan.get("frames_per_view") == n and "angles_deg" in base.plan:
+            self.plan = {**base.plan, "angles_deg": base.plan["angles_deg"][::n]}
         if base.emission is not None:
             raise ConfigError(f"--frames-per-view: {base.path} is of an emission, whose counts are not averaged.")
         self._update()
@@ -58,7 +170,7 @@ class AveragedSource(WrappedSource):
         self._used = self._without_alarms()
         lost = np.array([not rows for rows in usable], np.bool_)
         self.image_key = np.where(lost, FrameKind.INVALID, base.image_key[first]).astype(np.int32)
-        self.angles, self.exposures = self._mean(base.angles), base.exposures[first]
+        self.angles, self.exposures = self.of_frames(base.angles), base.exposures[first]
 
     def _apart(self) -> float:
         """Radians from a view's first frame from which on a frame is of another view."""
@@ -93,9 +205,9 @@ class AveragedSource(WrappedSource):
             open_group = []
         self._looked_at = open_group[0] if open_group else int(keys.size)
 
-    def _mean(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[row] means of values [frame ...] of base over the frames used."""
-        return np.array([values[rows].mean(axis=0) for rows in self._used]).reshape(-1, *values.shape[1:])
+    def of_frames(self, known: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Means over the frames used."""
+        return np.array([known[rows].mean(axis=0) for rows in self._used]).reshape(-1, *known.shape[1:])
 
     def _without_alarms(self) -> list[list[int]]:
         """Rows of base that a row is the mean of, without those with an alarm where others have none."""
@@ -103,14 +215,6 @@ class AveragedSource(WrappedSource):
         if flags is None or not flags.alarmed.any():
             return self._usable
         return [[row for row in rows if not flags.alarmed[row]] or rows for rows in self._usable]
-
-    @property
-    def plan(self) -> Mapping[str, Any]:
-        """That of base, with the angles of the views."""
-        plan = dict(self._base.plan)
-        if plan.get("frames_per_view") == self.frames_per_view and "angles_deg" in plan:
-            plan["angles_deg"] = plan["angles_deg"][:: self.frames_per_view]
-        return plan
 
     @property
     def attributes(self) -> Attributes:
@@ -140,26 +244,6 @@ class AveragedSource(WrappedSource):
         if regions is not None:
             regions = np.stack([_box_around(regions[rows]) for rows in self._used]) if self._used else regions[:0]
         return FrameFlags(bits, flags.legend, scores, regions)
-
-    @property
-    def currents(self) -> NDArray[np.float64] | None:
-        currents = self._base.currents
-        return None if currents is None else self._mean(currents)
-
-    @property
-    def energies(self) -> NDArray[np.float64] | None:
-        energies = self._base.energies
-        return None if energies is None else self._mean(energies)
-
-    @property
-    def times(self) -> NDArray[np.float64] | None:
-        times = self._base.times
-        return None if times is None else self._mean(times)
-
-    @property
-    def shifts(self) -> NDArray[np.float64] | None:
-        shifts = self._base.shifts
-        return None if shifts is None else self._mean(shifts)
 
     @property
     def part_starts(self) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Spots of single frames are counted; hot pixels, bright gaps that stay, edges and noise are none."""
+"""A step of the light is flagged in its view, with its size; spots of single frames are counted. Nothing else is."""
 
 from __future__ import annotations
 
@@ -9,10 +9,42 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.detector.zingers import VIEWS, ZingersCheck
+from beamline.monitor.detector.light import VIEWS, GainCheck, ZingersCheck
 from beamline.monitor.digest import digest
-from beamline.monitor.spots import Spots, spots_of
+from beamline.monitor.view import Spots, spots_of
 from drivers.base.frame import Frame
+from tests.beamline.monitor.blobs import COLS, Blobs
+
+
+def of_gain(scan: Blobs) -> list[Flag]:
+    return scan.flags([GainCheck()])
+
+
+@pytest.mark.parametrize(("share", "level"), [(0.02, Level.WARN), (-0.02, Level.WARN), (0.3, Level.ALARM)])
+def test_a_step_is_flagged_once_with_its_size(share: float, level: Level) -> None:
+    flags = of_gain(Blobs(60, counts=lambda view, light: light * (1 + share * (view >= 30))))
+    assert [(flag.frame, flag.level) for flag in flags] == [(40, level)]
+    assert flags[0].score == pytest.approx(share, rel=0.05)
+
+
+def test_a_single_dim_view_is_two_steps() -> None:
+    flags = of_gain(Blobs(60, counts=lambda view, light: light * (1 - 0.05 * (view == 30))))
+    assert [(flag.frame, round(flag.score, 2)) for flag in flags] == [(40, -0.05), (41, 0.05)]
+
+
+def test_drift_top_up_and_half_a_percent_are_no_step() -> None:
+    def light(view: int, image: np.ndarray) -> np.ndarray:
+        return image * np.exp(-view / 500) * (1 + 0.005 * (view >= 40))
+
+    assert of_gain(Blobs(80, counts=light)) == []
+
+
+def test_fog_is_no_step() -> None:
+    def fog(view: int, light: np.ndarray) -> np.ndarray:
+        return light * (1 + 0.3 * np.exp(-0.5 * ((np.arange(COLS) - 128 + 8 * (view - 40)) / 20) ** 2))
+
+    assert of_gain(Blobs(80, counts=fog)) == []
+
 
 SATURATION, BIN = 65535, 4
 

@@ -1,0 +1,273 @@
+"""Checks of frames by themselves: saturation, repeated images, triggers, light in darks, and a lost beam.
+
+Noise never repeats, so an equal checksum is a frame that was delivered again. Only the alarms of `lost` end a scan by
+default.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from math import nan
+from typing import Annotated, ClassVar
+
+import numpy as np
+import pydantic
+from numpy.typing import NDArray
+
+from beamline.monitor.check import AGAIN, Flag, Level, Logged, Look, Policy, ScanContext
+from beamline.monitor.digest import FrameDigest, thinned
+from beamline.monitor.references import FEW, READOUT
+from drivers.base.frame import Frame, FrameKind
+
+FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
+
+
+@dataclass(frozen=True)
+class SaturationState:
+    """`hot`: the fraction of the pixels that is saturated even without light."""
+
+    hot: float = 0.0
+
+
+@dataclass(frozen=True)
+class SaturationCheck(Logged):
+    """Score: fraction of saturated pixels beyond those that are saturated in the darks."""
+
+    name: ClassVar[str] = "saturation"
+    bit: ClassVar[int] = 1
+    unit: ClassVar[str] = "fraction of the pixels"
+    meaning: ClassVar[str] = "more pixels are saturated than in the darks"
+
+    warn: Annotated[float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
+    alarm: Annotated[
+        float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it is an alarm")
+    ] = 1e-3
+
+    start = SaturationState
+
+    def look(
+        self, state: SaturationState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> Look[SaturationState]:
+        if frame.kind is FrameKind.DARK:
+            return Look(SaturationState(max(state.hot, digest.saturated_fraction)))
+        score = digest.saturated_fraction - state.hot - context.spots.saturated / context.pixels
+        if score <= max(self.warn, FEW_PIXELS / context.pixels):
+            return Look(state)
+        level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)
+        advice = (
+            f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a "
+            "filter."
+        )
+        return Look(state, Flag(self.name, level, frame.index, score, limit, advice))
+
+
+@dataclass(frozen=True)
+class StuckState:
+    """Checksum and facts of the frame before.
+
+    Attributes:
+        checksum, angle: of it.
+        repeats: how many frames in a row have had this checksum.
+        noiseless: darks or flats of a single grey value repeat: a simulation without noise.
+    """
+
+    checksum: int | None = None
+    angle: float = nan
+    repeats: int = 0
+    noiseless: bool = False
+
+
+@dataclass(frozen=True)
+class StuckCheck(Logged):
+    """No limits: one repetition is one too many. Score: repetitions in a row."""
+
+    name: ClassVar[str] = "stuck"
+    bit: ClassVar[int] = 2
+    unit: ClassVar[str] = "repetitions"
+    meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
+
+    start = StuckState
+
+    def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
+        """Compare checksums. Without noise, references of one kind and the frames of a view are alike."""
+        plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
+        alike = digest.checksum == state.checksum
+        as_before = frame.kind is not FrameKind.PROJECTION or frame.angle == state.angle
+        state = replace(
+            state, checksum=digest.checksum, angle=frame.angle, noiseless=state.noiseless or (plain and alike)
+        )
+        if not alike or plain or (state.noiseless and as_before):
+            return Look(replace(state, repeats=0))
+        state = replace(state, repeats=state.repeats + 1)
+        advice = (
+            f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
+            "the camera or its driver repeats a buffer. Stop and restart the camera."
+        )
+        return Look(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))
+
+
+@dataclass(frozen=True)
+class TimingState:
+    """Trigger, framestamp and time of the projection before; -1 before the first."""
+
+    trigger: int = -1
+    framestamp: int = -1
+    time: float = 0.0
+
+
+@dataclass(frozen=True)
+class TimingCheck(Logged):
+    """Score: delay of the frame in periods (negative: early).
+
+    Triggers without a frame before it are an INFO: the frame after the gap is as good as any.
+    """
+
+    name: ClassVar[str] = "timing"
+    bit: ClassVar[int] = 4
+    unit: ClassVar[str] = "trigger periods"
+    meaning: ClassVar[str] = "the frame came early or late (fly scans)"
+
+    warn: Annotated[float, pydantic.Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
+
+    start = TimingState
+
+    def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
+        again = frame.replaces >= 0 or frame.trigger < state.trigger  # a repeated view has its old trigger
+        if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
+            return Look(state)
+        after = TimingState(frame.trigger, frame.framestamp, frame.time)
+        steps = frame.trigger - state.trigger
+        lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
+        if lost > 0:
+            advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
+            return Look(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
+        if state.trigger < 0 or 0 <= frame.framestamp <= state.framestamp:
+            return Look(after)  # armed anew, for another pass or after a pause
+        score = (frame.time - state.time) / context.period - steps
+        if abs(score) <= self.warn:
+            return Look(after)
+        advice = (
+            f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not "
+            "turn evenly, or the trigger line picks up noise."
+        )
+        return Look(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
+
+
+TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
+SHUT = 3.0  # flats outshine a dark by so many noises of its pixels, or the shutter was open
+
+
+@dataclass(frozen=True, eq=False)
+class DarkState:
+    """Preview blocks and mean counts of the first dark and mean of the first flat, None before any; `noise`: counts, of
+    a pixel of that dark."""
+
+    blocks: NDArray[np.float32] | None = None
+    dark: float | None = None
+    flat: float | None = None
+    noise: float = 0.0
+
+
+@dataclass(frozen=True)
+class DarkCheck(Logged):
+    """Score: dark over flat if the shutter seems open, otherwise counts of drift.
+
+    The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.
+    """
+
+    name: ClassVar[str] = "dark"
+    bit: ClassVar[int] = 6
+    unit: ClassVar[str] = "counts of drift, or fraction of the flats' counts"
+    meaning: ClassVar[str] = "a dark differs from the first one, or darks are nearly as bright as flats"
+
+    drift: Annotated[
+        float, pydantic.Field(ge=0, description="counts by which a dark may differ from the first one")
+    ] = 5.0
+    light: Annotated[
+        float, pydantic.Field(ge=0, description="fraction of the flats' mean from which a dark has light")
+    ] = 0.5
+
+    start = DarkState
+
+    def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[DarkState]:
+        if frame.kind is FrameKind.DARK:
+            return self._look_at_dark(state, frame.index, digest)
+        if frame.kind is FrameKind.FLAT and state.flat is None:
+            state = replace(state, flat=digest.mean)
+            if state.dark is not None and self._lit(state.dark, digest.mean, state.noise):
+                return Look(state, self._shutter_open(frame.index, state.dark / digest.mean))
+        return Look(state)
+
+    def _look_at_dark(self, state: DarkState, view: int, digest: FrameDigest) -> Look[DarkState]:
+        noise = math.sqrt(digest.variance)
+        if state.flat is not None and self._lit(digest.mean, state.flat, noise):
+            return Look(state, self._shutter_open(view, digest.mean / state.flat))
+        blocks = thinned(digest.preview)
+        if state.blocks is None:
+            return Look(replace(state, blocks=blocks, dark=digest.mean, noise=noise))
+        drift = _trimmed_mean(blocks - state.blocks)
+        if abs(drift) <= self.drift:
+            return Look(state)
+        advice = (
+            f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
+            "light."
+        )
+        return Look(state, Flag(self.name, Level.WARN, view, drift, self.drift, advice))
+
+    def _lit(self, dark: float, flat: float, noise: float) -> bool:
+        """Whether the dark has light; an offset below flats that are bright only against readout noise is ignored."""
+        few = noise < READOUT and SHUT * noise < flat - dark < FEW * noise
+        return dark > self.light * flat and not few
+
+    def _shutter_open(self, view: int, ratio: float) -> Flag:
+        advice = (
+            f"The darks have {ratio:.0%} of the flats' counts: the shutter was open for the darks or closed for the "
+            "flats. Check the shutter and the beam, then start again."
+        )
+        return Flag(self.name, Level.ALARM, view, ratio, self.light, advice)
+
+
+def _trimmed_mean(values: NDArray[np.float32]) -> float:
+    """Mean without the lowest and highest few (at least one each, where there are three)."""
+    ordered = np.sort(values, axis=None)
+    cut = min(max(1, ordered.size // TRIM), (ordered.size - 1) // 2)
+    return float(ordered[cut : ordered.size - cut].mean())
+
+
+@dataclass(frozen=True)
+class LostState:
+    """Empty state: the monitor itself keeps the last good view."""
+
+
+@dataclass(frozen=True)
+class LostCheck:
+    """Score: lost share of the light on nine tenths of the frame, against the last view with light.
+
+    The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
+    that turns takes no light from all places at once.
+    """
+
+    name: ClassVar[str] = "lost"
+    bit: ClassVar[int] = 7
+    unit: ClassVar[str] = "fraction of the light"
+    meaning: ClassVar[str] = "the beam is gone"
+    policy: ClassVar[Policy] = Policy.STOP
+
+    alarm: Annotated[
+        float, pydantic.Field(ge=0.5, le=1, description="fraction of the light without which it is lost")
+    ] = 0.5
+
+    start = LostState
+
+    def look(self, state: LostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[LostState]:
+        score = 1 - context.light_left
+        if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
+            return Look(state)
+        empty = "Every pixel has one value: the frame was never written, or the camera gave none. Look at the file."
+        advice = (
+            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
+            if digest.variance
+            else empty
+        )
+        return Look(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))

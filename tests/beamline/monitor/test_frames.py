@@ -1,0 +1,253 @@
+"""Checks of frames by themselves: saturated pixels, repeated images, triggers, darks that are not dark, no light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.monitor.check import Flag, Level, Policy, ScanContext
+from beamline.monitor.checks import CHECKS, bitmask
+from beamline.monitor.digest import digest
+from beamline.monitor.frames import DarkCheck, LostCheck, LostState
+from drivers.base.frame import Frame, FrameKind
+from tests.beamline.monitor.blobs import Blobs
+
+SATURATION, PIXELS = 65535, 64 * 96
+
+
+def burn(frames: list[Frame], n: int) -> list[Frame]:
+    """n pixels at the end of their range, in bright surroundings."""
+    for frame in frames:
+        frame.counts[:4] = SATURATION - 5000
+        frame.counts.ravel()[:n] = SATURATION
+    return frames
+
+
+@pytest.mark.parametrize(("n", "level"), [(3, Level.WARN), (6, Level.WARN), (7, Level.ALARM), (3000, Level.ALARM)])
+def test_saturated_pixels_are_flagged(fake: Any, n: int, level: Level) -> None:
+    flags = fake.of("saturation", fake.references() + burn(fake.views(1), n))
+    assert len(flags) == 1
+    assert flags[0].level is level
+    assert flags[0].score == pytest.approx(n / PIXELS)
+    assert "exposure" in flags[0].advice
+
+
+def test_a_pixel_or_two_are_no_exposure_too_long(fake: Any) -> None:
+    assert fake.of("saturation", fake.references() + burn(fake.views(2), 2)) == []
+
+
+def test_zingers_that_saturate_are_no_exposure_too_long(fake: Any) -> None:
+    frames = fake.references() + fake.views(3)
+    for at in (7, 30, 55, 80):
+        frames[-2].counts[20:22, at] = SATURATION
+    assert fake.of("saturation", frames) == []
+
+
+def test_pixels_that_are_hot_without_light_do_not_count(fake: Any) -> None:
+    frames = burn(fake.darks(), 100) + burn(fake.flats(), 100) + burn(fake.views(2), 100)
+    assert fake.of("saturation", frames) == []
+
+
+def test_saturated_flats_are_flagged(fake: Any) -> None:
+    assert len(fake.of("saturation", fake.darks() + burn(fake.flats(2), 50))) == 2
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_views_after_saturated_ones_are_not_taken_for_dim(fake: Any, share: float) -> None:
+    frames = fake.references() + fake.views(24)
+    row = len(frames) - 12
+    for frame in frames[row : row + 4]:
+        frame.counts[: int(share * len(frame.counts))] = SATURATION
+    assert {flag.frame for flag in fake.flags(frames) if flag.level is Level.ALARM} == set(range(row, row + 4))
+
+
+def test_a_repeated_buffer_is_flagged_each_time_and_counted(fake: Any) -> None:
+    frames = fake.references() + fake.views(6)
+    frames[13] = replace(frames[13], counts=frames[12].counts.copy())
+    frames[14] = replace(frames[14], counts=frames[12].counts.copy())
+    flags = fake.of("stuck", frames)
+    assert [(f.frame, f.score, f.level) for f in flags] == [(13, 1, Level.ALARM), (14, 2, Level.ALARM)]
+    assert "repeats a buffer" in flags[0].advice
+
+
+def test_one_changed_pixel_is_another_frame(fake: Any) -> None:
+    views = fake.views(2)
+    counts = views[0].counts.copy()
+    counts[5, 5] += 1
+    assert fake.of("stuck", [views[0], replace(views[1], counts=counts)]) == []
+
+
+def test_darks_without_noise_are_all_equal_and_say_nothing(fake: Any) -> None:
+    darks = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
+    assert fake.of("stuck", darks) == []
+
+
+def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
+    references = fake.references()
+    views = [replace(frame, counts=np.full_like(frame.counts, 5000)) for frame in fake.views(4)]
+    assert [(f.frame, f.score) for f in fake.of("stuck", references + views)] == [(11, 1), (12, 2), (13, 3)]
+
+
+def test_frames_of_a_view_without_noise_are_alike_and_views_are_not(fake: Any) -> None:
+    """Of a scene without noise with several frames a view; a camera's darks are never of one value."""
+    plain = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
+    flat = fake.flats(1)[0]  # of a beam that is not even
+    flats = [replace(flat, index=i) for i in range(3)]
+    assert fake.of("stuck", plain + flats) == []
+    assert [f.score for f in fake.of("stuck", fake.darks(3) + flats)] == [1, 2]
+    views = fake.views(6)
+    of_two = [replace(views[i // 2], index=i) for i in range(6)]
+    assert fake.of("stuck", plain + of_two) == []
+    assert [f.score for f in fake.of("stuck", fake.darks(3) + of_two)] == [1, 1, 1]
+    turned = [replace(frame, counts=views[0].counts) for frame in views]  # the stage turns, and the image stays
+    assert [f.score for f in fake.of("stuck", plain + turned)] == [1, 2, 3, 4, 5]
+
+
+PERIOD = 0.1  # of the fake scan
+
+
+@pytest.mark.parametrize(("shift", "views"), [(0.2, []), (-0.2, []), (0.3, [4, 5]), (-0.3, [4, 5])])
+def test_a_frame_off_its_time(fake: Any, shift: float, views: list[int]) -> None:
+    frames = fake.views(8)
+    frames[4] = replace(frames[4], time=frames[4].time + shift * PERIOD)
+    flags = fake.of("timing", frames)
+    assert [f.frame for f in flags] == views
+    if flags:
+        assert flags[0].score == pytest.approx(shift)
+        assert flags[0].level is Level.WARN
+
+
+def test_a_missing_trigger_is_told_and_is_no_fault_of_the_frame_after_it(fake: Any) -> None:
+    frames = fake.views(8)
+    del frames[3:5]
+    flags = fake.of("timing", frames)
+    assert [(f.frame, f.score, f.level) for f in flags] == [(5, 2, Level.INFO)]
+    assert bitmask(flags) == 0  # a reconstruction uses it: before, it left the good view out, too
+
+
+def test_a_step_scan_has_no_rhythm(fake: Any) -> None:
+    frames = [replace(f, time=f.time + f.trigger**2) for f in fake.views(8)]
+    assert fake.of("timing", frames, period=None) == []
+
+
+@pytest.mark.parametrize(("armed_anew", "found"), [(False, 1), (True, 0)])
+def test_a_wait_before_the_camera_was_armed_anew_is_no_finding(fake: Any, armed_anew: bool, found: int) -> None:
+    """As between two passes, or after a pause: the camera counts from 0 again."""
+    frames = [replace(f, time=f.time + 30 * (f.trigger >= 4)) for f in fake.views(8)]
+    if armed_anew:
+        frames[4:] = [replace(f, framestamp=f.trigger - 4) for f in frames[4:]]
+    assert len(fake.of("timing", frames)) == found
+
+
+def test_triggers_whose_views_are_stored_are_not_missing(fake: Any) -> None:
+    frames = fake.views(8)
+    del frames[3:5]
+    assert fake.of("timing", frames, stored=frozenset({3, 4})) == []
+    assert [f.score for f in fake.of("timing", frames, stored=frozenset({4, 6}))] == [1]
+
+
+def test_an_open_shutter_shows_at_the_first_flat(fake: Any) -> None:
+    flags = fake.of("dark", fake.darks(light=1.0) + fake.flats())
+    assert [(f.frame, f.level) for f in flags] == [(5, Level.ALARM)]
+    assert flags[0].score == pytest.approx(1.0, abs=0.01)
+    assert "shutter" in flags[0].advice
+
+
+def test_an_open_shutter_shows_in_darks_at_the_end(fake: Any) -> None:
+    flags = fake.of("dark", fake.flats() + fake.views(3) + fake.darks(2, light=0.9))
+    assert [f.frame for f in flags] == [8, 9]
+
+
+@pytest.mark.parametrize(("drift", "found"), [(4, 0), (-4, 0), (6, 2), (-20, 2)])
+def test_drifting_darks(fake: Any, drift: float, found: int) -> None:
+    late = [replace(f, counts=(f.counts.astype(int) + drift).astype("uint16")) for f in fake.darks(2)]
+    flags = fake.of("dark", fake.references() + late)
+    assert len(flags) == found
+    for flag in flags:
+        assert flag.level is Level.WARN
+        assert flag.score == pytest.approx(drift, abs=1)
+
+
+def small_darks(n: int, rng: np.random.Generator) -> list[Frame]:
+    """Darks of 32 x 48 pixels around 200 counts: one pixel of 30 000 counts moves their mean by 19."""
+    return [
+        Frame(rng.normal(200, 4, (32, 48)).round().astype(np.uint16), FrameKind.DARK, i, i, i, np.nan, 1000.0 + i, 0.05)
+        for i in range(n)
+    ]
+
+
+def flags_of(frames: list[Frame], preview_bin: int) -> list[Flag]:
+    state, found = DarkCheck().start(), []
+    for frame in frames:
+        look = DarkCheck().look(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
+        state = look.state
+        found += [] if look.flag is None else [look.flag]
+    return found
+
+
+@pytest.mark.parametrize("preview_bin", [1, 4, 16])
+@pytest.mark.parametrize("hit", [0, 3])
+def test_a_zinger_in_a_small_dark_is_no_drift(rng: np.random.Generator, preview_bin: int, hit: int) -> None:
+    frames = small_darks(6, rng)
+    frames[hit].counts[11, 17] = 30_000
+    assert abs(float(frames[3].counts.mean()) - float(frames[0].counts.mean())) > 15
+    assert flags_of(frames, preview_bin) == []
+
+
+@pytest.mark.parametrize("preview_bin", [4, 16])
+def test_light_on_a_part_of_the_dark_is_still_seen(rng: np.random.Generator, preview_bin: int) -> None:
+    frames = small_darks(6, rng)
+    frames[4].counts[:, :16] += 40  # a third of the frame
+    (flag,) = flags_of(frames, preview_bin)
+    assert (flag.frame, flag.level) == (4, Level.WARN)
+    assert 5 < flag.score < 40 / 3
+
+
+@pytest.mark.parametrize(("photons", "found"), [(8.0, 0), (0.0, 1)])
+def test_an_offset_under_few_photons_is_no_light(photons: float, found: int) -> None:
+    """8 photons of a count each beside 2 counts of readout are light; none at all is a shutter in the wrong state."""
+    rng = np.random.default_rng(4)
+    frames = [
+        replace(frame, kind=kind, counts=(100 + rng.poisson(light, (32, 48)) + rng.normal(0, 2, (32, 48))).astype("u2"))
+        for frame, kind, light in zip(
+            small_darks(2, rng), (FrameKind.DARK, FrameKind.FLAT), (0.0, photons), strict=True
+        )
+    ]
+    assert len(flags_of(frames, 4)) == len(flags_of(frames[::-1], 4)) == found
+
+
+def lost(scan: Blobs) -> list[Flag]:
+    return scan.flags([LostCheck()])
+
+
+@pytest.mark.parametrize("left", [0.0, 0.02, 0.4])
+def test_every_view_without_light_is_flagged_and_none_after(left: float) -> None:
+    flags = lost(Blobs(40, counts=lambda view, light: light * (left if 20 <= view < 33 else 1.0)))
+    assert [flag.frame for flag in flags] == list(range(30, 43))
+    assert all(flag.level is Level.ALARM for flag in flags)
+    assert flags[0].score == pytest.approx(1 - left, abs=0.05)
+
+
+def test_without_light_from_the_first_view_on() -> None:
+    assert len(lost(Blobs(6, counts=lambda view, light: 0 * light))) == 6
+
+
+def test_a_view_of_one_value_was_never_written() -> None:
+    dark = ScanContext(np.inf, 64, None, 0.1, light_left=0.0)
+    for image, said in ((np.zeros((8, 8)), "Every pixel has one value"), (100 + np.eye(8), "The beam is lost: 100%")):
+        counts = image.astype(np.uint16)
+        frame = Frame(counts, FrameKind.PROJECTION, 7, 7, 7, 0.0, 0.0, 1.0)
+        flag = LostCheck().look(LostState(), frame, digest(counts), dark).flag
+        assert flag is not None and flag.level is Level.ALARM and flag.advice.startswith(said)
+
+
+def test_a_dip_by_a_third_is_not_lost_nor_is_a_sample_that_covers_more() -> None:
+    assert lost(Blobs(40, counts=lambda view, light: light * (0.67 if view >= 20 else 1.0))) == []
+    assert lost(Blobs(40, depth=lambda view, image: image + 3.0 * (np.arange(128) < 2 * view))) == []
+
+
+def test_it_alone_ends_a_scan() -> None:
+    assert [check.name for check in CHECKS if check.policy is not Policy.LOG] == ["lost"]
