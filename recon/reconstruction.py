@@ -25,6 +25,8 @@ from recon.prep.counts import Counts, Emission, line_integrals, weighted_lines
 if TYPE_CHECKING:
     from torch import Tensor
 
+_LOOKED_AT, _LARGEST = 2**16, 1e15  # values; of line integrals, whose true ones end at about 15
+
 
 def reconstruct(
     projections: ArrayLike | Tensor | Counts | Emission,
@@ -170,4 +172,12 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
         raise ValueError(f"projections must be real numbers, got {given.dtype}")
     require_views(geometry, given)
     with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
-        return np.ascontiguousarray(given, np.float32)
+        data = np.ascontiguousarray(given, np.float32)
+    some = np.abs(data.reshape(-1)[:: max(1, data.size // _LOOKED_AT)])
+    some = some[np.isfinite(some)]
+    if some.size and (most := float(np.quantile(some, 0.9))) > _LARGEST:
+        raise ValueError(
+            f"one in ten line integrals is above {most:.3g}; up to {_LARGEST:g} are computed with, since float32 holds "
+            "no sums of the squares of larger ones. Divide them by a constant: the volume is then smaller by it"
+        )
+    return data

@@ -90,14 +90,14 @@ class StuckCheck(Logged):
     start = StuckState
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
-        """Compare checksums. Without noise, references of a single grey value and the frames of a view are alike."""
+        """Compare checksums. Without noise, references of one kind and the frames of a view are alike."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
         alike = digest.checksum == state.checksum
-        of_one_view = frame.kind is FrameKind.PROJECTION and frame.angle == state.angle
+        as_before = frame.kind is not FrameKind.PROJECTION or frame.angle == state.angle
         state = replace(
             state, checksum=digest.checksum, angle=frame.angle, noiseless=state.noiseless or (plain and alike)
         )
-        if not alike or plain or (state.noiseless and of_one_view):
+        if not alike or plain or (state.noiseless and as_before):
             return Look(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (

@@ -256,7 +256,7 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Re
 
 def saturation_limit(frame: ReferenceFrame, limits: ReferenceLimits) -> float:
     """Fraction of the pixels of a frame that may be saturated."""
-    return max(limits.saturated, ZINGERS / (frame.blocks.size * frame.block**2))
+    return max(limits.saturated, (ZINGERS + 0.9) / (frame.blocks.size * frame.block**2))  # blocks go beyond the edge
 
 
 def _of_one_number(frame: ReferenceFrame) -> bool:

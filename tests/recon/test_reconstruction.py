@@ -201,6 +201,12 @@ def test_one_view_is_refused(noisy: np.ndarray) -> None:
         recon.reconstruct(noisy[:1], VIEWS.select([0]))
 
 
+@pytest.mark.parametrize("method", ["fbp", "fista-tv", recon.Auto()])
+def test_line_integrals_beyond_any_are_refused_with_their_size(noisy: np.ndarray, method: str) -> None:
+    with pytest.raises(ValueError, match=r"line integrals is above [\d.]+e\+(19|20); up to 1e\+15"):
+        recon.reconstruct(noisy * np.float32(1e20), VIEWS, method)
+
+
 def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:
     degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, pixel_pitch=PITCH, axis_col=18.3)
     with pytest.warns(UserWarning, match=r"172\.5 rad.*np\.deg2rad"):

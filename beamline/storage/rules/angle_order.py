@@ -52,11 +52,10 @@ def angles_in_order(source: ScanSource) -> Iterator[Finding]:
     if elsewhere := list(_alike_elsewhere(seen, rows[order])):
         yield from elsewhere
     elif source.cone is None and (pair := _mirrored_neighbours(seen, rows[order])) is not None:
-        text = _stated(source, pair)
         yield Finding(
             "warning",
             RULE,
-            f"{text[0].upper()}{text[1:]} are mirror images, as views half a turn apart are. Unless the sample moved, "
+            f"{_stated(source, pair)} are mirror images, as views half a turn apart are. Unless the sample moved, "
             "the angles were taken modulo 180 degrees, or frames lie in another order than their angles. Give one for "
             "each projection, in their order, with --angles FILE.",
         )
@@ -100,14 +99,13 @@ def _lit(seen: CoarseViews, pairs: list[tuple[int, int]]) -> list[tuple[int, int
 
 def _stated(source: ScanSource, pair: tuple[int, int]) -> str:
     first, second = np.degrees(source.angles[list(pair)])
-    return f"frames {pair[0]} and {pair[1]}, stated at {first:.6g} and {second:.6g} degrees,"
+    return f"Frames {pair[0]} and {pair[1]}, stated at {first:.6g} and {second:.6g} degrees,"
 
 
 def _in_another_order(
     source: ScanSource, rows: NDArray[np.int64], jumps: NDArray[np.int64], far: tuple[int, int], near: tuple[int, int]
 ) -> Finding:
-    text = f"{_stated(source, far)} look alike, and {_stated(source, near)} do not. "
-    text = text[0].upper() + text[1:]
+    text = f"{_stated(source, far)} look alike, and f{_stated(source, near)[1:]} do not. "
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * rows.size:
         wrong = ", ".join(f"{row} ({np.degrees(source.angles[row]):.6g})" for row in rows[single[:5]].tolist())
@@ -151,11 +149,10 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Iterator[Fin
         return
     first = int(np.flatnonzero(odd)[0])
     pair = int(some[first]), int(some[like[first]])
-    text = _stated(seen.source, pair)
     yield Finding(
         "warning",
         RULE,
-        f"{text[0].upper()}{text[1:]} look more alike than neighbours, as {odd.sum()} of {some.size} views looked at "
+        f"{_stated(seen.source, pair)} look more alike than neighbours, as {odd.sum()} of {some.size} views looked at "
         "do. Unless the sample is symmetric, the angles are not in the order of the frames, or the sample went round "
         "more often than they state.",
     )

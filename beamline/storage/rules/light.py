@@ -23,7 +23,7 @@ from beamline.storage.rules.references import (
     reference_groups,
 )
 from drivers.base.frame import FrameKind
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64, median_deviation
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
@@ -43,6 +43,8 @@ BELOW, OF_VIEWS = (
     0.005,
     0.25,
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
+CUT, SOLID = 0.01, 0.9  # shares: of pixels with such neighbours; of these, that hold the end; clipped noise has half
+WHITE = 0.8  # change from pixel to pixel over that of the next but one: noise has 1, structure a quarter to a half
 OFFSET = 2**15  # of signed numbers that were stored as unsigned ones
 """Limits, each with its reason."""
 
@@ -112,7 +114,7 @@ def light_beside_flats(
 
 
 def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
-    """Darks are images, and no place of the views has fewer counts: light only adds.
+    """Darks are images, no place of the views has fewer counts, as light only adds, and counts do not end in the air.
 
     Args:
         accepted: all are used as they are, so that a fault is a warning.
@@ -122,6 +124,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
     groups = groups_taken(source) if accepted else reference_groups(source).good()
     if not (groups.darks and groups.flats):
         return
+    yield from _counts_cut(source, groups, accepted)
     of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
     dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
     if not dark.any() and _vary(source, of_flats) and not counts_photons(source):
@@ -147,6 +150,46 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         )
         sentence += "" if accepted else " --references accept uses these."
         yield Finding("warning" if accepted else "error", "light", sentence)
+
+
+def _counts_cut(source: ScanSource, groups: ReferenceGroups, accepted: bool) -> Iterator[Finding]:
+    """Flats of one number stand for all light, unless the air of the views has it without the noise of the sample.
+
+    Counts then end there. Beside a number that stands for a transmission of 1, half of the air lies below it, or no
+    image has noise.
+    """
+    dark, flat = (np.stack(cells_of(source, np.concatenate(rows))) for rows in (groups.darks, groups.flats))
+    if np.ptp(dark) or np.ptp(flat):
+        return
+    some = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views, end = read_known(source, some, _middle(source)).astype(np.float64), float(flat.flat[0])
+    noise = _white_noise(views, end)
+    at = views >= end
+    around = at[:, :-2, 1:-1] & at[:, 2:, 1:-1] & at[:, 1:-1, :-2] & at[:, 1:-1, 2:]
+    if noise > 0 and around.mean() > CUT and at[:, 1:-1, 1:-1][around].mean() > SOLID:
+        sentence = (
+            f"Every pixel of the flats, and {at.mean():.0%} of those of the views looked at, hold {end:g} without the "
+            f"noise of the others ({noise:.3g} from pixel to pixel): counts end there, and the light is not known. "
+            "Shorten the exposure or add a filter."
+        )
+        sentence += "" if accepted else " --references accept uses these as they are."
+        yield Finding("warning" if accepted else "error", "light", sentence)
+
+
+def _white_noise(views: F64, end: float) -> float:
+    """Standard deviation of counts below an end, where neighbours vary by themselves; 0 where matter varies more."""
+    below = np.where(views < end, views, np.nan)
+    near, far = (
+        median_deviation(below[:, n:, n:] - below[:, n:, :-n] - below[:, :-n, n:] + below[:, :-n, :-n]) / 2
+        for n in (1, 2)
+    )
+    return near if near > WHITE * far else 0.0
+
+
+def _middle(source: ScanSource) -> slice:
+    """Rows about the middle, in which noise is looked at."""
+    middle = source.shape[0] // 2
+    return slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
 
 
 def _vary(source: ScanSource, rows: NDArray[np.int64]) -> bool:
@@ -184,11 +227,9 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
 
 
 def _multiple(source: ScanSource, rows: NDArray[np.int64]) -> int:
-    """The largest power of two of which all counts of a frame are multiples; 1 of real numbers."""
-    image = read_known(source, [int(rows[0])])[0]
-    if image.dtype.kind not in "ui":
-        return 1
-    common = int(np.gcd.reduce(image.ravel().astype(np.int64)))
+    """The largest power of two of which all counts of frames are multiples; 1 of real numbers."""
+    images = read_known(source, spread(rows, VIEWS))
+    common = int(np.gcd.reduce(images.astype(np.int64), axis=None)) if images.dtype.kind in "ui" else 1
     return common & -common if common else 1
 
 
@@ -198,11 +239,9 @@ def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of views, so that their quietest places count.
     """
-    middle = source.shape[0] // 2
-    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
     views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
     taken = [np.concatenate(groups.darks), spread(max(groups.flats, key=len), VIEWS), views]
-    darks, flats, seen = (read_known(source, some, rows).astype(np.float32) for some in taken)
+    darks, flats, seen = (read_known(source, some, _middle(source)).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0
     light = flats.mean(axis=0) - darks.mean(axis=0)

@@ -263,8 +263,10 @@ def exposures_of(source: ScanSource) -> NDArray[np.float64]:
 
 
 def mean_cells(source: ScanSource, rows: Frames) -> NDArray[np.float32]:
-    """Cells of the mean of frames."""
-    return np.asarray(np.nan_to_num(np.mean(cells_of(source, rows), axis=0)), np.float32)
+    """Cells of the mean of frames, of those that can be read."""
+    cells = dict(zip(rows.tolist(), cells_of(source, rows), strict=True))
+    known = [cells[row] for row in cells if row not in source.unreadable] or list(cells.values())
+    return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
 
 
 def cells_of(source: ScanSource, rows: Frames) -> list[NDArray[np.float32]]:

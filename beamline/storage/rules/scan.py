@@ -28,6 +28,9 @@ SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
 TURNED = 12  # views by which the direction of the axis is told
 _LEAST = 8  # views, rows and columns: fewer tell nothing of it
+_SWAPPED = 2.0  # times as rough as with bytes exchanged; sound counts are smoother than that
+_LEAST_SQUARE = 16  # views and rows, as many
+_ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 
 
@@ -125,7 +128,16 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
 
 
 def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
-    """Counts beyond the end of a signed type are read without its sign."""
+    """Counts have the order of bytes and the sign that their type has; beyond a signed type, they are read without."""
+    views = _sample(source, FrameKind.PROJECTION) if source.dtype.kind in "ui" and source.dtype.itemsize > 1 else None
+    if views is not None and _roughness(views) > _SWAPPED * _roughness(views.astype(source.dtype).byteswap()):
+        yield Finding(
+            "error",
+            "pixels",
+            "From pixel to pixel the counts change without order, as bytes do that are read in the wrong order; with "
+            "the bytes of each number exchanged they are smooth. Write the images with the other order of bytes "
+            "(numpy: images.byteswap()).",
+        )
     if wrapped := source.attributes.get("pixels"):
         yield Finding("warning", "pixels", f"The file's label is wrong: counts are {wrapped}.")
 
@@ -187,6 +199,53 @@ def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]
     if not depths.max() > 0:  # neither counts nor transmission
         return depths[:0]
     return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))
+
+
+def views_first(source: ScanSource) -> Iterator[Finding]:
+    """Where there are as many views as rows, the first dimension counts views, and the second rows.
+
+    In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
+    moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
+    """
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    angles = source.angles[views]
+    if source.emission is not None or source.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
+        return
+    some = np.arange(views.size)[:: -(-views.size // SHAPES)]
+    depths = _depths(source, views[some]) if np.isfinite(angles).all() and source.shape[1] >= _LEAST else np.zeros(0)
+    if len(depths) != some.size:
+        return
+    ends = max(1, depths.shape[2] // 16)
+    depths = depths - np.median(np.concatenate([depths[..., :ends], depths[..., -ends:]], axis=2), axis=2)[..., None]
+    mass, first = depths.sum(axis=2), depths @ (np.arange(depths.shape[2]) - (depths.shape[2] - 1) / 2)
+    rows = len(mass[0])
+    along_rows = _explained(first.T, np.array([part.mean() for part in np.array_split(angles, rows)]))
+    along_frames = _explained(first, angles[some])
+    if mass.var(axis=0).sum() / len(mass[0]) > _OTHER_MASS * mass.var(axis=1).sum() / len(mass) and (
+        along_rows > _ON_A_SINE and 1 - along_frames > _OFF_A_SINE * (1 - along_rows)
+    ):
+        yield Finding(
+            "warning",
+            "axis",
+            f"The {views.size} images look like sinograms: the rows of each hold one mass, whose centre goes along a "
+            f"sine of the angles ({along_rows:.0%} of its change), as views do, and from image to image it does not "
+            f"({along_frames:.0%}). Then the first dimension counts rows of the detector. Say so by the attribute axes "
+            "of the dataset (y:theta:x), or write a copy as [view, row, column].",
+        )
+
+
+def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
+    """Share of the change of values [view, of each] that is a sine of the angles [view]."""
+    parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
+    rest = values - parts @ np.linalg.lstsq(parts, values, rcond=None)[0]
+    change = float(values.var(axis=0).sum())
+    return 1 - float((rest**2).mean(axis=0).sum()) / change if change > 0 else 0.0
+
+
+def _roughness(views: NDArray[Any]) -> float:
+    """Change from pixel to pixel over the spread of all; 0 where they are all the same."""
+    spread_of_all = float(views.std())
+    return float(np.abs(np.diff(views.astype(np.float64), axis=2)).mean()) / spread_of_all if spread_of_all else 0.0
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:
@@ -265,6 +324,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     pixels_as_labelled,
     views_scaled,
     axis_vertical,
+    views_first,
     series_complete,
     scale_known,
     pixels_square,

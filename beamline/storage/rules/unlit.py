@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.flats_with_sample import lit_places
-from beamline.monitor.references import BRIGHT, ReferenceFrame
+from beamline.monitor.references import BRIGHT
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, reference_frame
+from beamline.storage.rules.references import VIEWS, ReferenceGroups, cells_of, mean_cells
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, median_deviation
 from recon.base.views import spread
@@ -43,8 +43,8 @@ class ViewLight:
         views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
         if used is None:
             return cls(source, None, None, 1.0)
-        dark, flat = (_mean_cells(source, groups) for groups in (used.darks, used.flats))
-        seen = [brightness(_cells(source, row), dark, flat) for row in spread(views, VIEWS).tolist()]
+        dark, flat = (mean_cells(source, np.concatenate(groups)) for groups in (used.darks, used.flats))
+        seen = [brightness(cells, dark, flat) for cells in cells_of(source, spread(views, VIEWS))]
         return cls(source, dark, flat, float(np.percentile(seen, BRIGHT)) if seen else 1.0)
 
     def suspect(self, data: NDArray[np.generic], dark: F32 | None, flat: F32 | None) -> NDArray[np.bool_]:
@@ -81,7 +81,7 @@ class ViewLight:
         same = bool(image.min() == image.max())
         if self.dark is None or self.flat is None:
             return same
-        bright = brightness(_cells(self.source, frame), self.dark, self.flat)
+        bright = brightness(cells_of(self.source, np.array([frame]))[0], self.dark, self.flat)
         return bright < LEAST * self.usual or (same and bool(np.ptp(self.flat) > 0))
 
 
@@ -108,19 +108,3 @@ def _binned(image: NDArray[np.generic]) -> F32:
         sums = np.add.reduceat(sums, at, axis=axis)
     each = [np.diff(np.append(at, n)) for at, n in zip(starts, image.shape, strict=True)]
     return np.asarray(sums / np.multiply.outer(*each), np.float32)
-
-
-def _cells(source: ScanSource, row: int) -> F32:
-    return _cells_of(reference_frame(source, row))
-
-
-def _mean_cells(source: ScanSource, groups: tuple[Frames, ...]) -> F32:
-    rows = [row for group in groups for row in group.tolist()]
-    cells = {row: _cells(source, row) for row in rows}
-    known = [cells[row] for row in rows if row not in source.unreadable] or list(cells.values())
-    return np.asarray(np.mean(known, axis=0), np.float32)
-
-
-def _cells_of(frame: ReferenceFrame) -> F32:
-    assert frame.cells is not None
-    return frame.cells

@@ -73,6 +73,33 @@ def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
     assert f"{done['elapsed']:.1f} s" in page.partition("Time of the whole command")[2][:80]
 
 
+@pytest.mark.slow
+def test_times_of_a_followed_scan_on_the_terminal_and_the_page_and_in_events(folder: Path) -> None:
+    scene = {
+        "phantom": {
+            "kind": "solids",
+            "solids": [{"kind": "ellipsoid", "semi_axes": [0.1, 0.1, 0.1], "attenuation": 3}],
+        },
+        "beam": {"photons_per_s": 1e5},
+        "detector": {"shape": [12, 32], "pixel_size_um": 12.0, "exposure_s": 0.02},
+        "scan": {"views": 24, "darks": 2, "flats": 2},
+    }
+    (folder / "scene.yaml").write_text(json.dumps(scene), encoding="utf-8")
+    assert beamline("simulate", "scene.yaml", "--out", "own.h5").exit_code == 0
+    followed = "recon", "own.h5", "--follow", "--seconds", "1", "--gaussians", "200", "--axis", "15.5"
+    shown, told = beamline(*followed, "-o", "shown.h5"), beamline(*followed, "-o", "told.h5", "--json")
+    assert shown.exit_code == told.exit_code == 0, shown.output + told.output
+    done = json.loads(told.stdout.splitlines()[-1])
+    for label, of_event in (("reconstruction", done["seconds"]), ("the whole command", done["elapsed"])):
+        pages = [(folder / name).read_text(encoding="utf-8") for name in ("shown.html", "told.html")]
+        on_shown, on_told, on_terminal = (
+            sorted(re.findall(r"([\d.]+) s\b", text.partition(f"Time of {label}")[2][:80].partition("Time of")[0]))
+            for text in (*(re.sub(r"<[^>]*>|\s+", " ", page) for page in pages), shown.output)
+        )
+        assert on_shown == on_terminal != [] and f"{of_event:.1f}" in on_told
+    assert 0 < done["seconds"] <= done["elapsed"]
+
+
 @pytest.mark.feature
 @pytest.mark.slow
 def test_a_study_names_what_its_figures_are_of(folder: Path) -> None:

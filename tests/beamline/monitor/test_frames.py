@@ -94,6 +94,10 @@ def test_views_of_a_single_value_are_stuck_all_the_same(fake: Any) -> None:
 def test_frames_of_a_view_without_noise_are_alike_and_views_are_not(fake: Any) -> None:
     """Of a scene without noise with several frames a view; a camera's darks are never of one value."""
     plain = [replace(frame, counts=np.full_like(frame.counts, 200)) for frame in fake.darks(3)]
+    flat = fake.flats(1)[0]  # of a beam that is not even
+    flats = [replace(flat, index=i) for i in range(3)]
+    assert fake.of("stuck", plain + flats) == []
+    assert [f.score for f in fake.of("stuck", fake.darks(3) + flats)] == [1, 2]
     views = fake.views(6)
     of_two = [replace(views[i // 2], index=i) for i in range(6)]
     assert fake.of("stuck", plain + of_two) == []

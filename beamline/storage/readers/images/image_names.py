@@ -24,6 +24,7 @@ _TAGGED = re.compile(rf"(?<![a-z])(?:angle|theta|ang|deg)[ _=-]?({_NUMBER})|({_N
 _DEGREES_AND_THOUSANDTHS = re.compile(r"_(\d{3})_(\d{3})(?=_\d+$)")
 _LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
 _FARTHEST = 3600.0  # degrees
+_EVEN = 0.8  # of the steps of a number that counts images are alike; some images may be lost
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
 
@@ -223,6 +224,20 @@ def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     """The numbers of images that count frames, not dates."""
     numbers = _numbers(names)
     return None if numbers is None or np.ptp(numbers) > COUNTED * numbers.size else numbers
+
+
+def two_orders(names: Sequence[str]) -> bool:
+    """Names hold two numbers that count the images in even steps, each in an order of its own."""
+    digits = [re.findall(r"\d+", name) for name in names]
+    if len({len(each) for each in digits}) != 1:
+        return False
+    orders = set()
+    for column in zip(*digits, strict=True):
+        numbers = np.array([int(each[-18:]) for each in column], np.int64)
+        steps = np.diff(np.sort(numbers))
+        if steps.all() and np.mean(steps == np.median(steps)) > _EVEN:
+            orders.add(tuple(np.argsort(numbers)))
+    return len(orders) > 1
 
 
 def _several_series(path: object, names: Sequence[str]) -> str:

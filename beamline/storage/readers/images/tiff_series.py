@@ -26,8 +26,8 @@ from beamline.core.files import TEXT, decoded
 from beamline.core.text import size, spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import UnreadableError, require_real
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.base import WHOLE, NotUsed, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.images.image_names import NamedImages, in_order, two_orders, without_angle
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, image_of, is_hidden, read_image, refuse_volume
 from beamline.storage.writers.ending import ScanEnding
@@ -38,6 +38,13 @@ _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
+_SECOND_NUMBER = NotUsed(
+    "a second number in the names of the images",
+    "which counts them in another order than the first",
+    "images are in the order of the number that counts closest; if angles are in the order of the other, leave one of "
+    "them out of the names",
+    True,
+)
 
 
 class TiffSeriesSource(ScanSource):
@@ -65,6 +72,8 @@ class TiffSeriesSource(ScanSource):
             self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), offered(self)
+        if two_orders([without_angle(name) for name in series]):
+            self.not_used += (_SECOND_NUMBER,)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
         if np.isfinite(self.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}

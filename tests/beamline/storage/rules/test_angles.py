@@ -160,5 +160,6 @@ def test_any_number_of_views_shows_halves_exchanged_and_no_symmetric_sample(view
         assert "are mirror images" in hit.message
     copied = even.copy()
     copied[views // 2 : views // 2 + 2] = even[views // 2 - 1]
-    for balls in (ROD, [(0, 0, 22, 0.01), (9, 5, 6, 0.04)]):
+    two: Balls = [(0, 0, 22, 0.01), (9, 5, 6, 0.04)]
+    for balls in (ROD, two):
         assert ordered(scan(balls, copied, even)) == []

@@ -74,6 +74,13 @@ def test_counts_shifted_by_bits(bits: int, radius: float) -> None:
     assert f"counts of the views are multiples of {2**bits}" in said
 
 
+def test_multiples_are_those_of_all_frames() -> None:
+    darks, flats, views = counts(20.0)
+    views = views * 4
+    views[:-1] *= 2  # the first frame alone has only multiples of 8
+    assert "counts of the views are multiples of 4" in told(darks, flats, views)
+
+
 def test_an_offset_of_signed_numbers() -> None:
     darks, flats, views = counts(20.0)
     assert "They differ by 32768" in told(darks, flats, views + 32768)
@@ -102,6 +109,22 @@ def test_flats_that_end_at_one_count_everywhere() -> None:
     darks, flats, views = counts(20.0)
     darks = darks + np.random.default_rng(0).normal(0, 3, darks.shape)
     assert "every pixel of them holds 2500, though" in told(darks, np.minimum(flats, 2500), np.minimum(views, 2500))
+
+
+@pytest.mark.parametrize("radius", [20.0, 31.0])
+@pytest.mark.parametrize("dark", [0.0, 100.0])
+def test_flats_and_views_that_end_at_one_count_beside_darks_of_one_number(radius: float, dark: float) -> None:
+    _, flats, views = counts(radius)
+    said = told(np.full_like(flats, dark), np.minimum(flats, 2800), np.minimum(views, 2800))
+    assert said.startswith("refused: ")
+    assert "counts end there" in said
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.03])
+def test_transmission_in_whole_numbers_that_is_clipped_at_all_light_does_not_end(noise: float) -> None:
+    full, through = np.full((1, *SHAPE), 65535.0), np.exp(-lines(20.0))
+    through += noise * np.sqrt(through) * np.random.default_rng(3).standard_normal(through.shape)
+    assert "counts end" not in told(0 * full, full, 65535 * through.clip(0, 1))
 
 
 def test_a_step_and_turns_of_the_light_where_the_sample_fills_the_field() -> None:
