@@ -19,7 +19,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
 from recon.assess import metrics
-from simulators.frame.detector import Detector
+from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import Battery, labels_of
 
