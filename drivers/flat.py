@@ -74,7 +74,7 @@ _WITHIN: Mapping[str, Callable[[Any, Any], Any]] = {
 _WORDS = {"gt": ">", "ge": ">=", "le": "<=", "pattern": "text of the form", "min_length": "a length of at least"}
 
 
-class Declared:
+class CheckedSettings:
     """Settings whose fields are within the bounds that their keys declare.
 
     Raises:

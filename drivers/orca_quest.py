@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from drivers.base.protocols import CameraSettings, CameraTiming
-from drivers.flat import MEGABYTES, Declared, key
+from drivers.flat import MEGABYTES, CheckedSettings, key
 from recon.base.registry import unknown
 
 SENSOR_SHAPE = (2304, 4096)
@@ -185,7 +185,7 @@ class HotPixelMode(StrEnum):
 
 
 @dataclass(frozen=True)
-class DcamOptions(Declared):
+class DcamOptions(CheckedSettings):
     """Options of a `DcamCamera`.
 
     trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of

@@ -10,7 +10,7 @@ from enum import StrEnum
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
-from drivers.flat import Declared, key
+from drivers.flat import CheckedSettings, key
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
@@ -51,7 +51,7 @@ class _PvDevice:
 
 
 @dataclass(frozen=True)
-class ShutterPvs(Declared):
+class ShutterPvs(CheckedSettings):
     """The process variables of a shutter, each as pva://NAME or ca://NAME; times in s."""
 
     open_pv: str = key(problem=url_problem)
@@ -119,7 +119,7 @@ class PvShutter(_PvDevice):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilterPvs(Declared):
+class FilterPvs(CheckedSettings):
     """The process variables of a filter, as pva://NAME or ca://NAME; times in s."""
 
     pv: str = key(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
@@ -184,7 +184,7 @@ class EnergyUnit(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MonochromatorPvs(Declared):
+class MonochromatorPvs(CheckedSettings):
     """The process variables of a monochromator, as pva://NAME or ca://NAME; times in s, `tolerance` in eV."""
 
     pv: str = key(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)

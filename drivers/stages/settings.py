@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.flat import Declared, Key, flat_fields
+from drivers.flat import CheckedSettings, Key, flat_fields
 from drivers.flat import key as key
 
 FARTHEST = 1e9  # rad
@@ -33,7 +33,7 @@ def with_keys(name: str, driver: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class StageFigures(Declared):
+class StageFigures(CheckedSettings):
     """The limits of a stage: counts for 2π, rad/s, rad/s², soft limits in rad.
 
     Raises:
@@ -95,7 +95,7 @@ class StageFigures(Declared):
 
 
 @dataclass(frozen=True)
-class Wiring(Declared):
+class Wiring(CheckedSettings):
     """Connection of a stage's controller; times in s. The baud rate is the controller's, nominal over USB and TCP."""
 
     timeout: float = key(1.0, "For a reply.", unit="s", gt=0)

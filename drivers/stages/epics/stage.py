@@ -18,7 +18,7 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
-from drivers.flat import Declared
+from drivers.flat import CheckedSettings
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
 
@@ -37,7 +37,7 @@ class Search(StrEnum):
 
 
 @dataclass(frozen=True)
-class EpicsSettings(Declared):
+class EpicsSettings(CheckedSettings):
     """EPICS motor record at pva://NAME or ca://NAME. It gives no trigger pulses: step scans only.
 
     `unit` is the record's EGU; where it is another one than deg, as for a linear sample mover, it stands wherever a key

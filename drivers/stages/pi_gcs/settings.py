@@ -14,7 +14,7 @@ from enum import StrEnum
 from fractions import Fraction
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import Declared
+from drivers.flat import CheckedSettings
 from drivers.stages.settings import StageFigures, Wiring, key
 
 PULLED_APART = Fraction(1, 10)
@@ -96,7 +96,7 @@ class Reference(StrEnum):
 
 
 @dataclass(frozen=True)
-class PiGcsSettings(Declared):
+class PiGcsSettings(CheckedSettings):
     """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
 
     The axis is named as SAI? lists it. `firmware_pulse` is from memory; trains need equal pauses between pulses. A

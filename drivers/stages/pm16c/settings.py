@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import Declared
+from drivers.flat import CheckedSettings
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.travel import counts_in
 
@@ -97,7 +97,7 @@ def steepest_code(acceleration: float) -> int:
 
 
 @dataclass(frozen=True)
-class PM16CSettings(Declared):
+class PM16CSettings(CheckedSettings):
     """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
 
     Raises:

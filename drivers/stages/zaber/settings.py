@@ -13,14 +13,14 @@ import math
 from dataclasses import dataclass, field
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.flat import Declared, key
+from drivers.flat import CheckedSettings, key
 from drivers.stages.settings import StageFigures, Wiring
 
 SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
 
 
 @dataclass(frozen=True)
-class TriggerUse(Declared):
+class TriggerUse(CheckedSettings):
     """Use of the device's triggers. Defaults are its firmware's behaviour from memory; so is the encoder's unit,
     microsteps.
 
@@ -175,7 +175,7 @@ SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a 
 
 
 @dataclass(frozen=True)
-class ZaberSettings(Declared):
+class ZaberSettings(CheckedSettings):
     """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output.
 
     counts_per_turn must be the device's own limit.cycle.dist. The pulse width is whole milliseconds; None is 1 ms, or
