@@ -41,7 +41,7 @@ def axis_by_views(
     near: bool = False,
     lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
-    """The axis column with which a volume of two thirds of the views predicts the others best.
+    """The axis column for which a volume of two thirds of the views predicts the other views best.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
     best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,

@@ -144,7 +144,7 @@ def recover(file: Path, as_json: bool) -> None:
 
 
 def recovered_files(recovered: Iterable[Recovered], left_out: Iterable[str], sink: Sink, as_json: bool) -> None:
-    """Tell of each file of a run that was recovered, and of the parts that were left out."""
+    """Report each recovered file of a run, and the parts that were left out."""
     for sentence in left_out:
         click.echo(f"Warning: {sentence}", err=True)
     for done in recovered:

@@ -34,14 +34,14 @@ PRESETS_OF_METHODS = ("published",)
 
 
 def checkpoint_output(path: Path) -> Path:
-    """The path of a checkpoint to write. ValueError for a path without a file name."""
+    """The path of a checkpoint to write. Raises ValueError for a path without a file name."""
     if not path.name:
         raise ValueError(f"{str(path)!r} is no file; name one, such as fit.checkpoint.h5")
     return path
 
 
 def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
-    """Callback that checks a checkpoint to read. DataError if the file does not exist."""
+    """A callback that checks a checkpoint to read. Raises DataError if the file does not exist."""
     if path is not None and not path.exists():
         raise DataError(f"--{param.name} {path} is not there. Nothing was touched.")
     return path
@@ -54,7 +54,7 @@ def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any
 
 
 def row_settings(command: click.Command, methods: Sequence[str], values: dict[str, Any]) -> dict[str, dict[str, Plain]]:
-    """Settings by method, of the options of `row_options` that were given; takes all of these out of `values`.
+    """Settings by method, from the given options of `row_options`; removes these options from `values`.
 
     Raises:
         UsageError: an option that no method takes.
@@ -89,7 +89,7 @@ def method_with(name: str, settings: Mapping[str, Any], any_setting: Mapping[str
 
 
 def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
-    """Settings by name, from texts of NAME=VALUE separated by spaces; values are JSON, else plain text."""
+    """Parse settings by name from texts of NAME=VALUE separated by spaces; values are JSON, or else plain text."""
     settings: dict[str, Any] = {}
     for word in " ".join(values).split():
         name, equals, text = word.partition("=")
@@ -103,7 +103,7 @@ def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str
 
 
 def preset_of(method: str | None, preset: str | None) -> str | None:
-    """The name of the method with a preset's settings; the method itself without one.
+    """The method of this name with a preset's settings; without a preset, with its defaults.
 
     Raises:
         UsageError: the method has no such preset.

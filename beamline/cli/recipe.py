@@ -26,7 +26,7 @@ _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as th
 
 
 class Repeatable(click.Command):
-    """A command that remembers its options as they were typed."""
+    """A command that records its options as they were typed."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         ctx.meta[_RAW] = self.make_parser(ctx).parse_args(args=list(args))[0]
@@ -63,7 +63,7 @@ def _is_of_one_call(option: click.Option) -> bool:
 
 
 def recipe_text(ctx: click.Context, method: str) -> str:
-    """The recipe of this call, as YAML: the method, and the given options that hold for any scan."""
+    """The recipe of this call as YAML: the method, and the given options that are not specific to one scan."""
     values = {
         name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
@@ -124,7 +124,7 @@ def _from_anywhere(value: str, kind: object) -> str:
 
 
 def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --config: a recipe, whose options hold where the command line has none."""
+    """Add --config: a recipe whose options apply unless the command line overrides them."""
     return declared_option(
         "--config",
         of_one_call=True,
@@ -215,7 +215,7 @@ def heading(group: str) -> Decorator:
 
 
 class Grouped(Repeatable):
-    """A command with many options. Each of them has a group.
+    """A command whose options are shown in groups.
 
     Args:
         first: names of the parameters that `--help` shows, in this order.

@@ -60,7 +60,7 @@ class LogLines:
 
 @contextmanager
 def logged(path: Path | None, warn: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes a log, if one is requested. An error in the block becomes its last line.
+    """The sink that writes the log, if one is requested. An error in the block becomes its last line.
 
     If its disk is full, `warn` gets a warning, and the work goes on.
     """
@@ -194,7 +194,7 @@ def _in_time() -> str:
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError for a recipe whose options do not go together, or with a volume, whatever the scan."""
+    """Raise UsageError for a recipe whose options contradict each other, or cannot be used with a volume, for any scan."""
     with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
         values = dict(context.params)
         method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
@@ -203,7 +203,7 @@ def refuse_recipe(config: Path) -> None:
 def run_reconstruction(
     options: ReconOptions, values: Mapping[str, Any], more: Callable[[ReconRecord], Sequence[str]] = lambda record: ()
 ) -> None:
-    """Write the volume and its report, with what happens on the terminal.
+    """Write the volume and its report, with progress on the terminal.
 
     Args:
         values: of the command's parameters; those that it lacks are not given.
@@ -245,7 +245,7 @@ def run_reconstruction(
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
-    """Raises QualityError if the data residual of a finished volume exceeds the limit."""
+    """Raise QualityError if the data residual of a finished volume exceeds the limit."""
     name = "residual_held_out" if "residual_held_out" in metrics else "residual"
     if not metrics[name] <= max_residual:
         views = "held out" if name == "residual_held_out" else "used"

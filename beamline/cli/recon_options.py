@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def memory_size(text: str) -> int:
-    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units). ValueError for anything else."""
+    """Parse a size such as 8G, 500M or 1.5GB (decimal units) to bytes. Raises ValueError for any other text."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
         raise ValueError(f"{text!r} is no size; expected a number and K, M, G or T, such as 8G")
@@ -43,7 +43,9 @@ def memory_size(text: str) -> int:
 
 
 def cluster_of(text: str) -> str:
-    """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
+    """Parse a cluster: number of workers, `local:N`, an address or `slurm:CONFIG`. Raises ValueError for any other
+    text.
+    """
     from beamline.reconstruct.memory import cluster  # here: help needs none of it
 
     cluster().check_cluster(text)
@@ -55,7 +57,9 @@ _FOR_COMPARISON = ", ".join(name for name, entry in _OF_FEATURES if not (entry.s
 
 
 def region_of(text: str) -> Region | AroundSample:
-    """A box of voxels, `z0:z1,y0:y1,x0:x1`, or that around the sample, `auto`. ValueError for anything else."""
+    """Parse a box of voxels, `z0:z1,y0:y1,x0:x1`, or `auto` for the one around the sample. Raises ValueError for any
+    other text.
+    """
     from beamline.reconstruct.region import AroundSample, Region  # here: help needs none of it
 
     return AroundSample() if text == "auto" else Region.parse(text)

@@ -36,7 +36,7 @@ TABLE = ".csv"  # suffix of a table of scans
 
 @dataclass(frozen=True, eq=False)
 class ScanRequest:
-    """What `beamline scan` is asked for."""
+    """The arguments of `beamline scan`."""
 
     files: tuple[Path, ...] = set_by(
         click.argument("files", metavar="[CONFIG|TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
@@ -92,7 +92,7 @@ class ScanRequest:
 @click.command()
 @with_request(ScanRequest)
 def scan(request: ScanRequest) -> None:
-    """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
+    """Run the scan in CONFIG, or continue one that ended early (--resume RUN).
 
     Several CONFIGs, or a TABLE with a line for each scan (docs/commands.md), are taken one after the other. One that
     fails does not stop the others; Ctrl-C does.
@@ -160,7 +160,7 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
-    """How long a rehearsal took and the scan will take. `--discard` removes its folder where all frames are good."""
+    """Duration of the rehearsal and of the scan, as lines. `--discard` removes the folder if all frames are good."""
     from beamline.plan.timeline import duration_text
     from beamline.scan.preflight import dry_run
 
@@ -232,7 +232,7 @@ def run_one(
     held: ExitStack,
     stop: StopRequest | None = None,
 ) -> RunResult:
-    """Run the scan, or what `series` lacks, with the terminal, the page and the documents beside it."""
+    """Run the scan, or the missing energies of `series`, with the terminal, the page and the documents beside it."""
     from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.run import run_scan
 
@@ -267,7 +267,7 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
 
 
 def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> SeriesRun:
-    """Take, or go on with, a scan of each energy, with the terminal and the page beside it."""
+    """Scan at each energy, or continue the series, with the terminal and the page beside it."""
     from beamline.scan.energies import run_energies
     from beamline.scan.live_process import Commands, commands_of
 

@@ -65,7 +65,7 @@ class RandomAngles(_Span):
 
 
 class InterlacedAngles(_Span):
-    """The fixed angles taken in several passes, each pass in the gaps that the earlier ones left."""
+    """The fixed angles in several passes, each pass in the gaps of the earlier ones."""
 
     scheme: Literal["interlaced"]
     passes: Views
@@ -149,7 +149,7 @@ class StorageSection(Section):
 
 
 class StopWhen(Section):
-    """When the views are enough, by what the live volume predicts; where both limits are given, both must be met."""
+    """Limits at which the views suffice, as predicted from the live volume; if both are given, both must be met."""
 
     psnr_gain_per_10_views: PositiveFloat | None = None
     """dB that ten more views may still add; null: any."""

@@ -31,7 +31,7 @@ class Tree:
     origins: Mapping[KeyPath, str]
 
     def origin(self, path: KeyPath) -> str:
-        """The origin of the value at `path`, or of the nearest group around it."""
+        """The origin of the value at `path`, or of the nearest enclosing group."""
         while path not in self.origins and path:
             path = path[:-1]
         return self.origins[path]
@@ -118,7 +118,7 @@ def override(
     environment: Mapping[str, str],
     is_text: Callable[[Sequence[str]], bool] = lambda keys: False,
 ) -> Tree:
-    """The tree with BEAMLINE_SECTION__KEY variables and then `section.key=value` overrides put over it.
+    """The tree overridden by BEAMLINE_SECTION__KEY variables and then by `section.key=value`.
 
     Values are YAML; those of text keys are the text as it stands, where it is not quoted as YAML. A variable without a
     double underscore is ignored.
@@ -172,7 +172,7 @@ _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
-    """One line for each fault, in the order of the model's keys; one fault a key.
+    """One line for each fault, in the order of the model's keys; one fault per key.
 
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.

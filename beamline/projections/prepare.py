@@ -77,7 +77,7 @@ def prepare_projections(
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
-    """Read, correct and align what `selection` asks for.
+    """Read, correct and align the views of `selection`.
 
     Args:
         source: a finished scan.
@@ -149,13 +149,13 @@ def _with_held_out(
 
 
 def refuse_spilled(source: ScanSource) -> None:
-    """Raise DataError for a scan whose views cannot lie on disk."""
+    """Raise DataError for a scan whose views cannot be stored on disk."""
     if source.emission is not None:
         raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
 
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
-    """Raise what `prepare_projections` refuses before it reads a frame."""
+    """Raise the errors of `prepare_projections` that can be found without reading a frame."""
     if source.emission is None:
         _usable(source, selection, lambda sentence: None)
 
@@ -271,7 +271,7 @@ def assemble(
     warn: Warn,
     on_disk: bool = False,
 ) -> PreparedProjections:
-    """Corrected views with their geometry, after a look at what correction had to repair.
+    """Corrected views with their geometry, after reporting the pixels that the correction repaired.
 
     Args:
         geometry: of these views.
@@ -344,7 +344,7 @@ def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> floa
 
 
 def report_defects(projections: Projections, warn: Warn) -> None:
-    """Tell of what correction had to repair, where it is more than a stray pixel in a thousand."""
+    """Report repaired pixels if there are more than one in a thousand."""
     unseen = areas(projections.masked)
     masked = float((projections.masked & ~unseen).mean())
     if unseen.mean() > 1e-3:

@@ -25,7 +25,7 @@ _SHOWN = 40  # most characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
-    """Origin of a fit or a slab: checksum of the data, geometry and settings.
+    """The origin of a fit or a slab: checksum of its data, geometry and settings.
 
     Args:
         prepared: line integrals and geometry; views held out do not matter.
@@ -69,7 +69,7 @@ def _difference(current: Value, stored: Value) -> str:
 
 @dataclass(frozen=True)
 class CheckpointOptions:
-    """Files of a fit's state.
+    """The checkpoint files of a fit: where to write, and which to resume from.
 
     Attributes:
         path: to write; None: no checkpoint.
@@ -84,7 +84,7 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raises DataError before any work: the checkpoint to write exists, or the one to resume from is missing.
+        """Raise DataError before any work if the checkpoint to write exists, or the one to resume from is missing.
 
         The checkpoint may replace the one that the fit resumes from.
         """
@@ -94,7 +94,7 @@ class CheckpointOptions:
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
-        """The state to resume from; None if a fit begins anew.
+        """The state to resume from; None if the fit starts anew.
 
         Args:
             origin: of the fit, see `origin_of`.
@@ -121,7 +121,7 @@ class CheckpointOptions:
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Keep the state. If the disk refuses, warn, return the reason, and let the fit go on; "" if it was kept."""
+        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on success."""
         if self.path is None:
             return ""
         try:
@@ -153,7 +153,7 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
 
 
 def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], of: str) -> None:
-    """Raises DataError if a file has another origin, with the differences; `of` names the content of the file."""
+    """Raise DataError with the differences if a file has another origin; `of` names the content of the file."""
     others = differences(now, before)
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")

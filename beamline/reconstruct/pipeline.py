@@ -50,7 +50,7 @@ _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 @contextmanager
 def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan that runs, or one that has ended, when its last view is there: its fit has learnt all views.
+    """The job of a scan that is followed while it runs, after its last view: its model has been fitted to all views.
 
     Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`; where the block fails
     the newest ones stay, else the picture.
@@ -156,7 +156,7 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
 
 @contextmanager
 def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan whose views are all there, with compiled kernels; slabs stay where the block fails.
+    """The job of a scan whose views are all recorded, with compiled kernels; slabs are kept if the block fails.
 
     Raises:
         ConfigError, DataError: the views, the memory or the disk do not suffice.
@@ -236,7 +236,7 @@ def _announce(options: ReconOptions, prepared: PreparedProjections, channels: Ch
 def reconstruct_file(
     options: ReconOptions, sink: Sink, clock: Clock, stop_scope: StopScope = never_stopped
 ) -> ReconRecord:
-    """Reconstruct a scan that has ended, or while it runs. Returns the record of the volume, as the event `done` does.
+    """Reconstruct a finished or a running scan. Returns the record of the volume, as in the event `done`.
 
     A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`. One by a direct
     method is interrupted like all else, with nothing written; one in slabs keeps those that are finished.

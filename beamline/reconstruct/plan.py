@@ -75,12 +75,12 @@ class ReconPlan(Need):
 
     @property
     def line_integrals(self) -> int:
-        """Bytes of the views on disk."""
+        """Bytes of the line integrals on disk."""
         return self.needs.line_integrals if self.slabs else 0
 
 
 def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> ReconPlan:
-    """The plan before a frame is read.
+    """The plan before any frame is read.
 
     Args:
         needs: as `recon_memory_of` says.
@@ -110,7 +110,7 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
 
 
 def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepared: PreparedProjections) -> ReconPlan:
-    """The plan for the views as they were read.
+    """The plan for the views after reading.
 
     Args:
         plan: before they were.
@@ -134,7 +134,7 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
 
 
 def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, geometry: Geometry) -> None:
-    """Raise DataError and ConfigError for the geometry of all views, once the axis is known."""
+    """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
     if options.method.traits.several:
@@ -201,7 +201,7 @@ def _plan(
 def prepare_within(
     source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, ReconPlan]:
-    """As `prepare_projections`, and the plan: of a volume in slabs line integrals lie on disk."""
+    """`prepare_projections`, and the plan: for a volume made in slabs, line integrals are stored on disk."""
     selection = options.selection
     try:
         needs = recon_memory_of(source, options)
@@ -233,7 +233,7 @@ def prepare_within(
 
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
-    """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
+    """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
     seconds = source.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)

@@ -29,7 +29,7 @@ DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block with its frames and missing triggers. again: it repeats views, whose loss is no failure."""
+    """A block with its frames and missing triggers. again: it repeats views, so losing them is no failure."""
 
     block: Block
     taken: BlockTally

@@ -447,7 +447,7 @@ class _Run:
 
 
 def wait_in_pause(recorder: Recorder) -> bool:
-    """Wait a moment, while paused, and look whether the disk works; whether Enter was pressed at the terminal."""
+    """Wait a moment during a pause, and check the disk; returns whether Enter was pressed at the terminal."""
     time.sleep(PAUSE_POLL)
     recorder.check()
     return enter_pressed()

@@ -85,7 +85,7 @@ class Recovered:
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
-    """Clear the mark of the dead writer, cut what was not committed, and add what a writer adds at the end.
+    """Clear the mark of the dead writer, truncate uncommitted data, and add what a writer adds at the end.
 
     Args:
         say: is told the room needed, before anything is written.

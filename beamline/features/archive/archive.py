@@ -53,7 +53,7 @@ def _counter(progress: Progress | None, total: int) -> CountImage:
 
 @dataclass(frozen=True)
 class Archived:
-    """What was written, and compared with the raw file.
+    """The written copy, and its comparison with the raw file.
 
     Attributes:
         sources: the raw file, then the files that it draws frames from; raw_bytes: of all of them.
@@ -147,7 +147,7 @@ def _damaged(scan: Path, rows: set[int]) -> DataError:
 
 
 def drop_from_cache(path: Path) -> None:
-    """Have the system read the file from the disk from now on, not from its memory, where it can be told so."""
+    """Make the system read the file from the disk, not from its cache, if it can be told so."""
     if sys.platform == "linux":
         with path.open("rb") as file:
             os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
@@ -214,7 +214,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def filter_of(codec: str) -> Mapping[str, Any]:
-    """The keywords of an HDF5 dataset that is compressed by a codec of these."""
+    """The keywords of an HDF5 dataset that is compressed by one of these codecs."""
     filters: Mapping[str, Any] = {
         "blosc2": hdf5plugin.Blosc2("zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE),
         "bitshuffle-zstd": hdf5plugin.Bitshuffle(cname="zstd", clevel=3),

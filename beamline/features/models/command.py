@@ -39,7 +39,7 @@ _MOST_VIEWS = 1_000_000
 
 
 def box_of(text: str) -> Box:
-    """Three intervals Z0:Z1,Y0:Y1,X0:X1 of lengths. ValueError for anything else."""
+    """Parse three intervals Z0:Z1,Y0:Y1,X0:X1 of lengths. Raises ValueError for any other text."""
     try:
         box = tuple((float(low), float(high)) for low, high in (part.split(":") for part in text.split(",")))
     except ValueError:
@@ -50,7 +50,7 @@ def box_of(text: str) -> Box:
 
 
 def angles_of(text: str) -> NDArray[np.float64]:
-    """FIRST:END:STEP or angles apart by commas, in degrees, as radians. ValueError for anything else."""
+    """Parse FIRST:END:STEP or angles separated by commas, in degrees, to radians. Raises ValueError for any other text."""
     try:
         first, *rest = (float(part) for part in text.split(":"))
         if len(rest) == 2 and rest[1] and 0 < (n := math.ceil((rest[0] - first) / rest[1] - 1e-9)) <= _MOST_VIEWS:
@@ -202,7 +202,7 @@ def _mesh_path(text: str) -> Path:
 @dataset_option
 @json_option
 def surface(volume: Path, output: Path, level: float | None, source: str, dataset: str | None, as_json: bool) -> None:
-    """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm where the voxel is known).
+    """Write the surface of the matter in VOLUME as triangles, in its unit of length (mm if the voxel size is known).
 
     The mesh is watertight: matter that leaves the volume is closed at its faces. Nothing is overwritten.
     """

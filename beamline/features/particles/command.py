@@ -113,7 +113,7 @@ def segment(
 
 
 def summary(result: Segmented, options: SegmentOptions) -> str:
-    """The result for people."""
+    """The result as lines for people."""
     figures, unit = result.particles.statistics(), result.unit
     _, rows, cols = result.box
     crop = "none, the whole volume"

@@ -30,7 +30,7 @@ class SweptOption:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The values, where all are numbers; else none."""
+        """The values as numbers; empty if some are no numbers."""
         numeric = all(re.fullmatch(_NUMBER, value) for value in self.values)
         return tuple(map(float, self.values)) if numeric else ()
 
@@ -77,7 +77,7 @@ def _values(name: str, text: str) -> tuple[str, ...]:
 
 
 def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
-    """Each combination of values, by name; the last option changes fastest.
+    """All combinations of values, by name; the last option varies fastest.
 
     Raises:
         ValueError: not one or two different options, or too many combinations.

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def listed(value: str) -> tuple[str, ...]:
-    """Names of methods, separated by commas. ValueError for another name."""
+    """Parse names of methods separated by commas. Raises ValueError for an unknown name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     if others := [name for name in wanted if name not in names_of_one_volume()]:
         raise ValueError(unknown_method(others[0], names_of_one_volume()))
@@ -61,7 +61,7 @@ _OF_MATERIALS = "needs --spectra, with what pure materials attenuate at each ene
 
 @dataclass(frozen=True, eq=False)
 class TradeoffRequest:
-    """What `beamline tradeoff` is asked for."""
+    """The arguments of `beamline tradeoff`."""
 
     files: tuple[Path, ...] = set_by(
         heading(DATA),

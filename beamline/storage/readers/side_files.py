@@ -31,7 +31,7 @@ _MOST = 20  # files beside a scan that are looked at
 
 @dataclass(frozen=True)
 class MakerKeys:
-    """Where a maker's file has what we need, as "section/key" in small letters; "" for what it does not state.
+    """Keys of a vendor's file, as "section/key" in lower case; "" for what it does not state.
 
     Attributes:
         sod, sdd: distances from the source to the axis and to the detector, mm.
@@ -90,7 +90,7 @@ _ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states 
 
 @dataclass(frozen=True, eq=False)
 class SideFile:
-    """What a maker's file states of a scan; None for what it does not.
+    """The geometry of a scan stated by a vendor's file; None for what it does not state.
 
     Attributes:
         cone: mm from the source to the rotation axis and to the detector.
@@ -120,7 +120,7 @@ class SideFile:
 
 
 class SidedSource(WrappedSource):
-    """A ScanSource with the distances and the pixel size of a maker's file."""
+    """A ScanSource with the distances and the pixel size of a vendor's file."""
 
     def __init__(self, base: ScanSource, side: SideFile) -> None:
         """Raises DataError where it is of another number of projections."""
@@ -138,7 +138,7 @@ class SidedSource(WrappedSource):
 
 
 def read_side_file(path: Path) -> SideFile:
-    """Read a maker's file.
+    """Read a vendor's file.
 
     Raises:
         DataError: it is none of those, or lacks a distance, the pixel size or the number of projections.
@@ -155,7 +155,7 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The maker's file in or beside a folder of images, or a TIFF, if one alone is of as many projections."""
+    """The vendor's file in or beside a folder of images, or a TIFF, if exactly one has as many projections."""
     if not source.format.startswith("tiff"):
         return None
     views, found = int((source.image_key == FrameKind.PROJECTION).sum()), []
@@ -167,7 +167,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 
 
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
-    """What a maker's file beside these images states."""
+    """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
     return () if side is None else (NotUsed(side.path.name, str(side), f"--from {side.path} takes it", True),)
 

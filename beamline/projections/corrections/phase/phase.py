@@ -39,7 +39,7 @@ def _unsharp(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Phase:
-    """How phase is retrieved.
+    """Settings of the phase retrieval.
 
     Attributes:
         material: the ratio of delta to beta, or a material, as the user said it; None: it is not retrieved.
@@ -94,7 +94,7 @@ class Phase:
             return None
 
     def delta_beta(self, energy_kev: float) -> float:
-        """The ratio of delta to beta. ValueError: the material is not known."""
+        """The ratio of delta to beta. Raises ValueError for an unknown material."""
         if (ratio := self._ratio) is not None:
             return ratio
         from recon.prep.matter import delta_beta
@@ -119,7 +119,7 @@ class Phase:
         return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
-        """The filter for the pixels that the selection makes, and a sentence about it.
+        """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
             ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.

@@ -22,7 +22,7 @@ SETS = ("attenuation", "normalisation", "randoms", "scatter")
 
 
 class EmissionSource(StacksSource):
-    """A scan of a sample that emits. Its pixels are line integrals of the activity; `emission` has what was counted."""
+    """An emission scan. Its pixels are line integrals of the activity; `emission` has the counts."""
 
     def __init__(self, path: Path, file: h5py.File) -> None:
         views = dataset_at(file, f"{GROUP}/counts")
