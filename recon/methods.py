@@ -55,7 +55,8 @@ def names() -> tuple[str, ...]:
 
 
 def names_of_one_volume() -> tuple[str, ...]:
-    """Names of the methods that make one volume of all views, as rows of a table do; imports no module of this project."""
+    """Names of the methods that make one volume of all views, as rows of a table do; imports no module of this
+    project."""
     return tuple(name for name, entry in METHODS.items() if not entry.several)
 
 

@@ -78,7 +78,7 @@ def _only(runs: Path) -> Path:
 
 @click.command()
 @config_argument
-@click.option("--yes", is_flag=True, help="Do not ask whether the stage may turn.")
+@click.option("--yes", is_flag=True, help="Skip the question whether the stage may turn.")
 @click.option("--timeout", type=POSITIVE, default=300.0, show_default=True, help="Longest time of the search, s.")
 @set_option
 def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> None:
@@ -192,7 +192,11 @@ def print_schema() -> None:
 @click.command()
 @config_argument
 @set_option
-@click.option("--rehearse", is_flag=True, help="As `beamline scan --rehearse` would run it.")
+@click.option(
+    "--rehearse",
+    is_flag=True,
+    help="Show the configuration with simulated devices, as `beamline scan --rehearse` would run it.",
+)
 @json_option
 def check(file: Path, overrides: tuple[str, ...], rehearse: bool, as_json: bool) -> None:
     """Validate CONFIG. Nothing moves.

@@ -43,7 +43,7 @@ def checkpoint_output(path: Path) -> Path:
 def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
     """A callback that checks a checkpoint to read. Raises DataError if the file does not exist."""
     if path is not None and not path.exists():
-        raise DataError(f"--{param.name} {path} is not there. Nothing was touched.")
+        raise DataError(f"--{param.name} {path} does not exist. Nothing was changed.")
     return path
 
 
@@ -134,7 +134,7 @@ _STEPS = run_option(
     "--steps",
     type=WholeRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-    f"{MODEL_STEPS} where views held out say that voxels alone predict as well.",
+    f"{MODEL_STEPS} where voxels alone predict held-out views as well.",
 )
 _GAUSSIANS = run_option(
     "--gaussians",
@@ -145,7 +145,7 @@ _FINISH = run_option(
     "--finish",
     type=WholeRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
-    "with sparse patches where views held out are predicted better so.",
+    "with sparse patches where these predict held-out views better.",
 )
 _ITERATIONS = run_option(
     "--iterations",
@@ -161,7 +161,7 @@ _PATCH_THRESHOLD = run_option(
     "--patch-threshold",
     type=POSITIVE,
     help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
-    "Default: as views held out prefer.",
+    "Default: chosen by held-out views.",
 )
 _ALLOW_NEGATIVE = run_option(
     "--allow-negative",
@@ -181,7 +181,7 @@ _IN_TIME = together(
     run_option(
         "--moves/--no-moves",
         default=None,
-        help="With --time: matter moves, or only its density changes. Default: what views held out prefer.",
+        help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -249,7 +249,7 @@ method_options = together(
     run_option(
         "--early-stop",
         is_flag=True,
-        help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
+        help="End the fit when held-out views stop improving; every tenth view is held out unless --views holds out some.",
     ),
     _FINISH,
     heading(OUTPUT),

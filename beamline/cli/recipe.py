@@ -152,7 +152,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
             raise click.BadParameter(f"{value}: {unknown('option of a recipe', name, options)}")
         if not isinstance(text, str) or not text:
             raise click.BadParameter(
-                f"{value}: {name} holds no text or several; expected one value, as on the command line"
+                f"{value}: {name} is not a single value; expected one value, as on the command line"
             )
         option = options[name]
         defaults[str(option.name)] = text.split() if option.multiple else text
@@ -167,9 +167,9 @@ def _read(path: Path) -> Mapping[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise click.BadParameter(f"{path} cannot be read ({error})") from error
     except (yaml.YAMLError, RecursionError) as error:
-        raise click.BadParameter(f"{path} is no YAML: {' '.join(str(error).split())}") from error
+        raise click.BadParameter(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
-        raise click.BadParameter(f"{path} is no recipe; expected lines such as method: fbp")
+        raise click.BadParameter(f"{path} is not a recipe; expected lines such as method: fbp")
     return content
 
 
@@ -182,7 +182,7 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} holds no recipe; expected a volume that `beamline recon` wrote")
+            raise click.BadParameter(f"{path} contains no recipe; expected a volume that `beamline recon` wrote")
         return str(record.parameters["recipe"])
 
 

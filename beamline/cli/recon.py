@@ -135,7 +135,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     path = values["output"] or Path(f"{file.stem}_{method}.h5")
     if there and not file.exists():
         with json_events(values["as_json"]):
-            raise DataError(f"{file} is not there.")
+            raise DataError(f"{file} does not exist.")
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.options import FollowTiming, OutputPaths, ReconOptions, report_beside
     from recon.voxels.enough_views import Goal
@@ -189,12 +189,13 @@ def _checked_method(context: click.Context, default: str = "") -> str:
 
 def _in_time() -> str:
     if IN_TIME is None:
-        raise click.UsageError("--time: this installation makes no volumes in time. Leave it out.")
+        raise click.UsageError("--time: this installation cannot reconstruct a time series. Leave it out.")
     return IN_TIME
 
 
 def refuse_recipe(config: Path) -> None:
-    """Raise UsageError for a recipe whose options contradict each other, or cannot be used with a volume, for any scan."""
+    """Raise UsageError for a recipe whose options contradict each other, or cannot be used with a volume, for any
+    scan."""
     with recon.make_context("beamline recon", ["SCAN", "--config", str(config)]) as context:
         values = dict(context.params)
         method_with(_checked_method(context), settings_of(recon, values), values["any_setting"])
@@ -237,9 +238,9 @@ def run_reconstruction(
     if not values["as_json"]:
         click.echo("\n".join([results(record), *more(record)]))
     if lost := record.ending.lost_checkpoint:
-        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
+        raise DataError(f"The last checkpoint could not be written: {lost} The volume is in {output}.")
     if record.ended_early:
-        raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
+        raise ScanStopped(f"The reconstruction was stopped early; {output} has the volume reached so far.")
     if limit is not None:
         require(record.metrics, limit)
 

@@ -63,10 +63,12 @@ class ScanRequest:
         'Needs: pip install "splatline[bluesky]".',
     )
     stop_on_failure: bool = set_by(
-        "--stop-on-failure", is_flag=True, help="Of several scans: begin none after the first one that fails."
+        "--stop-on-failure", is_flag=True, help="With several scans: stop after the first one that fails."
     )
     wait: bool = set_by(
-        "--wait", is_flag=True, help="Of several scans: wait for Enter before each but the first, to change the sample."
+        "--wait",
+        is_flag=True,
+        help="With several scans: wait for Enter before each but the first, so that the sample can be changed.",
     )
     as_json: bool = set_by(json_option)
     output: Path | None = set_by(
@@ -194,11 +196,13 @@ def _refuse_contradictions(request: ScanRequest) -> None:
     if request.run is None:
         return
     if request.output is not None or (request.overrides and request.file is None):
-        raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+        raise click.UsageError("--resume continues RUN with its own configuration: leave out -o and --set.")
     if request.rehearse:
-        raise click.UsageError("--rehearse begins a run: --resume goes on with its devices, simulated ones, too.")
+        raise click.UsageError(
+            "--rehearse starts a new run; --resume already uses the devices of RUN, simulated or real: leave out --rehearse."
+        )
     if request.documents is not None:
-        raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
+        raise click.UsageError("--documents describes complete scans: leave it out with --resume.")
 
 
 def _are_several_scans(files: Sequence[Path]) -> bool:
@@ -210,7 +214,7 @@ def _queue() -> Any:
     """The module of the feature whose `take_all` takes several scans. UsageError: this installation has none."""
     modules = in_folders("beamline.features", "QUEUES")
     if "scan" not in modules:
-        raise click.UsageError("This installation takes one scan at a time: give one CONFIG. Nothing was started.")
+        raise click.UsageError("This installation runs one scan at a time: give one CONFIG. Nothing was started.")
     return import_module(modules["scan"])
 
 
@@ -262,7 +266,7 @@ def _config_of_energies(config: Config | None, run: Path | None, documents: str 
     if config is None or config.scan.energies is None:
         return None
     if documents is not None:
-        raise click.UsageError("--documents tells one scan: leave it out with scan.energies.")
+        raise click.UsageError("--documents describes a single scan: leave it out with scan.energies.")
     return config
 
 
@@ -272,7 +276,7 @@ def take_energies(config: Config, request: ScanRequest, others: Sequence[Sink], 
     from beamline.scan.live_process import Commands, commands_of
 
     if request.discard:
-        raise click.UsageError("--discard does not go with scan.energies: leave it out.")
+        raise click.UsageError("--discard cannot be combined with scan.energies: leave it out.")
     with _shown(request, others, stop) as (sinks, ask):
         return run_energies(
             config, request.output, sinks, stop,

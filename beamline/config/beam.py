@@ -124,7 +124,7 @@ class FoundFilter(Section):
 def refuse_equal(places: Mapping[str, float | str]) -> None:
     """Raise ValueError if two positions have the same value."""
     if len(set(places.values())) < len(places):
-        raise ValueError("two places have the same value and cannot be told apart; give each its own")
+        raise ValueError("two positions have the same value; give each a different one")
 
 
 class BeamMonitorSection(Section):
@@ -167,7 +167,8 @@ class BeamMonitorSection(Section):
 
     @abstractmethod
     def connect(self, clock: Clock, url: str | None = None) -> BeamMonitor:
-        """Connect the beam monitor, or its simulated counterpart at `url`. Raises DeviceError if it cannot be opened."""
+        """Connect the beam monitor, or its simulated counterpart at `url`. Raises DeviceError if it cannot be
+        opened."""
 
 
 class NoBeamMonitor(Section):

@@ -165,7 +165,7 @@ class DeviceSection(Section):
         camera, high = self.camera, self.stage.settings.wiring.active_high
         if isinstance(camera, SimulatedOrca) and (camera.trigger_polarity == "positive") is not high:
             raise ValueError(
-                f"stage.active_high {str(high).lower()} does not go with camera.trigger_polarity "
+                f"stage.active_high {str(high).lower()} contradicts camera.trigger_polarity "
                 f"{camera.trigger_polarity}: the simulated cable has no inverter, and every exposure would begin at "
                 f"its pulse's end; set trigger_polarity {'positive' if high else 'negative'}"
             )

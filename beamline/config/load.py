@@ -59,7 +59,9 @@ def load(
     try:
         text = text_in(path, SETTINGS)
     except FileNotFoundError:
-        raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
+        raise ConfigError(
+            f"{path} does not exist; `beamline config init > my.yaml` creates a configuration to edit."
+        ) from None
     except OSError as error:
         if (kind := kind_of_data(path)) is not None:
             raise ConfigError(
@@ -126,8 +128,7 @@ def override_of(key: str, value: object) -> str:
         text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True)
     except yaml.YAMLError:
         raise ConfigError(
-            f"{key}: a configuration cannot hold {value!r}; expected a number, a text, a list or a group. Nothing "
-            "was started."
+            f"{key}: {value!r}; expected a number, a text, a list or a group. Nothing was started."
         ) from None
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 

@@ -178,9 +178,13 @@ class ReconSection(Section):
     @model_validator(mode="after")
     def _somebody_looks(self) -> Self:
         if self.stop_when is not None and not self.live:
-            raise ValueError("stop_when needs live: true, because the live reconstruction tells when views are enough")
+            raise ValueError(
+                "stop_when needs live: true, because the live reconstruction decides when the views suffice"
+            )
         if self.stop_when is not None and (self.method == AUTO or not streams(self.method)):
-            raise ValueError(f"stop_when needs a method whose volume grows while views come, as r2; got {self.method}")
+            raise ValueError(
+                f"stop_when needs a method whose volume grows with the views, such as r2; got {self.method}"
+            )
         return self
 
 
@@ -221,7 +225,7 @@ class Config(Section):
             odd = next(name for name, value in simulated.items() if value is few_simulated)
             raise ValueError(
                 f"devices.{odd}: simulated and real devices cannot be mixed: {unreal} simulated, {real} real. Make all "
-                "simulated or none. `beamline scan CONFIG --rehearse` takes a real configuration with simulated devices"
+                "simulated or none. `beamline scan CONFIG --rehearse` runs a real configuration with simulated devices"
             )
         if any(simulated.values()) and self.simulation is None:
             raise ValueError(
@@ -270,7 +274,7 @@ class Config(Section):
         if twice := [text for text in texts if texts.count(text) > 1]:
             raise ValueError(f"scan.energies lists {twice[0]} keV twice, to seven digits; give each energy once")
         if several and self.recon.stop_when is not None:
-            raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
+            raise ValueError("recon.stop_when is for a single scan, but scan.energies lists several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)
         if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(

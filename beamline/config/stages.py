@@ -91,7 +91,8 @@ class StageSection(Section):
         return read_from(self, STAGES[self.kind].Settings)
 
     def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
-        """Connect the driver at the port, or at `url`; see `StageDriver`. Settings of a real stage are stored on disk."""
+        """Connect the driver at the port, or at `url`; see `StageDriver`. Settings of a real stage are stored on
+        disk."""
         stage = STAGES[self.kind](url or self.port, self.settings, clock)
         try:
             if not (url or self.port).lower().startswith("sim://"):

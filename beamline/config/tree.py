@@ -45,9 +45,11 @@ def read(text: str, name: str) -> Tree:
     """
     data, origins = _parsed(text, name)
     if data is None:
-        raise ConfigError(f"{name}: is empty; `beamline config init` prints a complete example. Nothing was started.")
+        raise ConfigError(
+            f"{name}: the configuration is empty; `beamline config init` prints a complete example. Nothing was started."
+        )
     if not isinstance(data, dict):
-        raise ConfigError(f"{name}:1: holds no `key: value` lines; `beamline config init` prints a complete example.")
+        raise ConfigError(f"{name}:1: has no `key: value` lines; `beamline config init` prints a complete example.")
     return Tree(data, origins)
 
 
@@ -86,10 +88,12 @@ def _line(node: yaml.Node) -> int:
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
     if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
-        raise ConfigError(f"{name} holds more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
+        raise ConfigError(
+            f"{name} has more than {_MOST_VALUES} values: this cannot be a configuration. Nothing was started."
+        )
     if isinstance(node, yaml.ScalarNode):
         if "\0" in node.value:
-            raise ConfigError(f"{name}:{_line(node)}: a text holds a NUL character. Nothing was started.")
+            raise ConfigError(f"{name}:{_line(node)}: a text contains a NUL character. Nothing was started.")
         # Python neither reads nor writes very long numbers.
         if node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS:
             raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")

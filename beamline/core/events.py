@@ -447,7 +447,8 @@ class Diagnosed(Listed, event="check"):
 
 
 class RunDone(Event, event="done"):
-    """A run has ended successfully. result: a `RunResult`; read from the line of another process, its values by name."""
+    """A run has ended successfully. result: a `RunResult`; read from the line of another process, its values by
+    name."""
 
     folder: Path
     result: Any = _spread(RunResult.run_values)

@@ -324,7 +324,8 @@ def _remove_left(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file from memory as `whole_file` does, and verify it by reading it back. Raises DataError if it differs."""
+    """Write a file from memory as `whole_file` does, and verify it by reading it back. Raises DataError if it
+    differs."""
     data = content.encode() if isinstance(content, str) else content
     with whole_file(path, replace=replace) as partial:
         partial.write_bytes(data)

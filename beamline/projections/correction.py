@@ -64,7 +64,7 @@ class ScanCorrection:
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
-            raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
+            raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
         elif selection.step(Preparation).by_current:
             current_scale(source)  # refuses a file without any
         self._named_unlit: set[int] = set()  # views without light that were named

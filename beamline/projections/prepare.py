@@ -151,7 +151,7 @@ def _with_held_out(
 def refuse_spilled(source: ScanSource) -> None:
     """Raise DataError for a scan whose views cannot be stored on disk."""
     if source.emission is not None:
-        raise DataError(f"{source.path}: counts of an emission stay in memory. Give more --memory, or --rows.")
+        raise DataError(f"{source.path}: an emission scan must fit into memory. Give more --memory, or --rows.")
 
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
@@ -213,7 +213,7 @@ def _corrected(
     if 2 * projections.view_ids.size < used.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
-            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
+            "light, no finite pixel, or not the pixels that were written. These are too few to stand for the scan: choose "
             "those that can be used with --views, or repeat the others."
         )
     return projections
@@ -292,9 +292,9 @@ def assemble(
         warn(passing_sentence(ranges, geometry.n_views))
     ids = projections.view_ids
     if ids.size < 2:
-        raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")
+        raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
     if not projections.data.any():
-        raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
+        raise DataError(f"{source.path}: the chosen views are zero everywhere: there is no sample in the beam.")
     axis_col, estimate = axis
     rows, (height, width) = rows_of(source, selection), geometry.detector_shape
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)

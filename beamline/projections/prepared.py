@@ -232,7 +232,7 @@ def hold_out(
     count = max(1, n // one_in)
     count = count if most is None else min(count, most)
     if n - count < 2:
-        raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
+        raise ConfigError(f"{n} views are too few for held-out views; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     return with_views_held_out(prepared, held)

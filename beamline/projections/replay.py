@@ -204,7 +204,7 @@ def frames_of(
         assert follow is not None and writer is not None
         if why := writer.lost(follow.now(), n > done, lambda: source.finished):
             raise DataError(
-                f"{source.path} {why} and is not finished; its {n} frames were looked at. {next_step(source.path)}"
+                f"{source.path} {why} and is not finished; its {n} frames were checked. {next_step(source.path)}"
             )
         done = n
         follow.sleep(POLL)

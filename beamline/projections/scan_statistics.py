@@ -55,7 +55,8 @@ def statistics_of(
     progress: Callable[[int, int], None],
     kinds: Sequence[FrameKind] = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION),
 ) -> list[KindStatistics]:
-    """Statistics of the frames of these kinds that the scan has. `progress` is called with frames read and their total."""
+    """Statistics of the frames of these kinds that the scan has. `progress` is called with frames read and their
+    total."""
     chosen = {}
     for kind in kinds:
         rows = np.flatnonzero(source.image_key == kind)
@@ -134,7 +135,7 @@ class LightAsked:
             ConfigError: there are no darks and flats, or the scan does not state what a dose needs.
         """
         if not {FrameKind.DARK, FrameKind.FLAT} <= set(source.image_key):
-            raise ConfigError(f"{source.path} has no darks and flats, which tell the light.")
+            raise ConfigError(f"{source.path} has no darks and flats, which are needed to measure the light.")
         if self.material is not None:
             _gray(self.material, source, 0.0)
 
@@ -142,7 +143,7 @@ class LightAsked:
 def _gray(material: str, source: ScanSource, photons: float) -> float:
     """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse_impossible`."""
     if source.cone is not None:
-        raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
+        raise ConfigError(f"{source.path} is a cone-beam scan; --dose-in is for a parallel monochromatic beam.")
     if source.pixel_size_mm is None or source.energy_kev is None:
         missing = "pixel size" if source.pixel_size_mm is None else "energy"
         raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")

@@ -97,7 +97,7 @@ def rows_of(source: ScanSource, selection: Selection) -> slice:
     height, width = source.shape
     first, end = selection.rows or (0, height)
     if not 0 <= first < end <= height:
-        raise ConfigError(f"--rows {first}:{end} do not lie in the detector's 0:{height}.")
+        raise ConfigError(f"--rows {first}:{end} is out of range: the detector has rows 0:{height}.")
     n = selection.binning
     if not 1 <= n <= min(end - first, width):
         raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
@@ -129,7 +129,7 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
     if (cone := cone_of(source, selection)) is not None:
         if pitch is None:
             raise ConfigError(
-                f"{source.path} does not say its pixel size, which a cone beam needs: give --pixel-size-um (on the "
+                f"{source.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
                 "detector)."
             )
         # The central ray meets the middle of the detector, whatever rows are read.

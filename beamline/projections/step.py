@@ -69,7 +69,7 @@ def positive(text: str) -> float:
     """Check that the value is a finite number above 0; raises ValueError otherwise."""
     number = float(text)
     if not 0 < number < math.inf:
-        raise ValueError(f"{text} is not in the range x>0")
+        raise ValueError(f"{text} is not above 0")
     return number
 
 

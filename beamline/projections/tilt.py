@@ -81,7 +81,7 @@ def shown_tilt(
             heights.append(first + (height - 1) / 2)
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
-        raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
+        raise ValueError(f"{len(means)} bands of rows; at least {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
 
 

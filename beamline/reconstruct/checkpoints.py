@@ -111,23 +111,24 @@ class CheckpointOptions:
         refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
-                f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
+                f"--resume {self.resume} has {reached.step} steps already, more than the {steps} requested: give at "
                 f"least {reached.step} with --steps, or start anew without --resume."
             )
         if steps != kept.steps or steps == 0:
             was, now = (f"{n} steps" if n else "a time" for n in (kept.steps, steps))
             plans = f"over {was}, this one is over {now}" if was != now else "over a time, as this one is"
-            warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
+            warn(f"The checkpoint is of a fit {plans}: the learning rates continue at the same step of the new plan.")
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on success."""
+        """Write the checkpoint. If the disk refuses, warn, return the reason, and let the fit continue; "" on
+        success."""
         if self.path is None:
             return ""
         try:
             write_checkpoint(self.path, Checkpoint(state, origin, steps))
         except DataError as error:
-            warn(f"A checkpoint was left out: {error}")
+            warn(f"A checkpoint could not be written: {error}")
             return str(error)
         return ""
 
@@ -144,7 +145,7 @@ def _read_state(path: Path) -> tuple[Checkpoint, FitState]:
         for name, values in kept.state.items():
             # The last loss and the best of views held out may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
-                raise ValueError(f"{name} of the checkpoint holds values that are not finite")
+                raise ValueError(f"{name} of the checkpoint has values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):
             raise ValueError(f"the density unit of the checkpoint is {reached.unit}")
     except ValueError as error:

@@ -174,10 +174,10 @@ def planned_views(
     if cone_of(source, selection) is not None:
         raise ValueError("its beam is a cone")
     if source.part_starts.size > 1:
-        raise ValueError("it goes on with a run that ended early, so that views come out of their order")
+        raise ValueError("it resumes a run that ended early, so that its views are not in the planned order")
     angles = source.plan.get("angles_deg")
     if angles is None or axis_col is None:
-        raise ValueError("its file does not say which views are planned")
+        raise ValueError("its file does not state the planned views")
     places = parse_views(selection.views, np.zeros(len(angles)))
     last = max(int(ids[-1]) for ids in taken)
     n_taken = int(np.isin(source.image_key[: last + 1], (FrameKind.PROJECTION, FrameKind.INVALID)).sum())
@@ -242,7 +242,7 @@ def report_gain(
     try:
         planned = planned_views(views.source, views.selection, axis_col, taken)
     except ValueError as error:
-        warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
+        warn(f"The gain of further views cannot be predicted: {error}. The scan is not stopped early.")
         return False
     gain = enough.look(data, planned)
     if gain is None:

@@ -208,7 +208,7 @@ def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstr
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
     """The volume with the standard deviation of each voxel; if that was stopped, without it and with a warning."""
     if made.ending.early:
-        job.channels.warn("The error bars were left out, as the reconstruction was stopped.")
+        job.channels.warn("There are no error bars, because the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
@@ -224,7 +224,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
     except ValueError as error:  # hours may be in the volume
         deviation, why = None, str(error)
     if deviation is None:
-        job.channels.warn(f"The error bars were left out: {why}. The volume is whole.")
+        job.channels.warn(f"There are no error bars: {why}. The volume is complete.")
         return made
     factors = method_on_voxels(method, decided.made).traits.error_bars
     assert factors is not None
@@ -265,7 +265,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
         asked = method.gaussians
     if isinstance(asked, int) and resume is None and started_from < asked:
         job.channels.warn(
-            f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more."
+            f"The fit started from {started_from} Gaussians, not from {asked}: the sample is too small for more."
         )
     if method.traits.held_out:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})

@@ -54,7 +54,8 @@ _SHADED = "Something stands in the beam of all views, though not of the flats: a
 
 
 class ScanFollower:
-    """Follows the file of a running scan and updates the volume. The caller decides when to read, to fit and to finish."""
+    """Follows the file of a running scan and updates the volume. The caller decides when to read, to fit and to
+    finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self.source = source
@@ -202,7 +203,9 @@ class ScanFollower:
         """Read the remaining frames of a scan that has ended; after a stop, only those that a volume needs."""
         while self._cursor.behind:
             if self.n_views_taken >= _LEAST_VIEWS and should_stop():
-                self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.views.n} views.")
+                self._warn(
+                    f"Stopped: the volume is reconstructed from the first {self.n_views_taken} of {self.views.n} views."
+                )
                 return
             self.take_new_frames(ended=True)
 
@@ -316,7 +319,7 @@ class ScanFollower:
         steps = in_order(self._options.selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
-                f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
+                f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
         self.correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)

@@ -39,12 +39,12 @@ def read_truth(spec: str) -> NDArray[np.float32]:
     """
     match = re.fullmatch(r"(?P<path>.+?)(:(?P<first>\d*):(?P<end>\d*))?", spec)
     if match is None or not Path(match["path"]).exists():
-        raise ConfigError(f"--truth {spec}: there is no such file. Expected FILE or FILE:first:end.")
+        raise ConfigError(f"--truth {spec}: the file does not exist. Expected FILE or FILE:first:end.")
     path = Path(match["path"])
     try:
         data, _ = whole_volume(path, _volume_in(path))
     except DataError as error:
-        raise DataError(f"--truth {path} holds no volume that can be read: {error}") from error
+        raise DataError(f"--truth {path} contains no readable volume: {error}") from error
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
     if not 0 <= first < end <= data.shape[0]:
         raise ConfigError(f"--truth {spec}: slices {first}:{end} do not lie in 0:{data.shape[0]}.")
@@ -187,11 +187,11 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
         if masks is not None:
             labels, _ = whole_volume(masks)
             if not np.isin(labels, (0, 1, 2)).all():
-                raise ValueError(f"{masks} holds other labels than 0 (not used), 1 (dense) and 2 (empty)")
+                raise ValueError(f"{masks} has other labels than 0 (not used), 1 (dense) and 2 (empty)")
             regions = np.array([-1, 1, 0], np.int8)[labels.astype(np.intp)]
             values["snr"], values["cnr"] = metrics.snr_cnr(volume, regions)
     except ValueError as error:
-        raise DataError(f"{path} cannot be measured so: {error}.") from error
+        raise DataError(f"{path} cannot be measured: {error}.") from error
     return {name: float(value) for name, value in values.items()}
 
 
@@ -248,7 +248,7 @@ def _residual(
         squared, total = squared + left.sum(), total + own.sum()
         progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
-        raise ValueError("projections are all zero, so there is nothing to explain")
+        raise ValueError("all projections are zero, so no residual can be computed")
     return float(np.sqrt(squared / total))
 
 

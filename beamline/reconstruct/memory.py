@@ -240,5 +240,5 @@ def cluster() -> Any:
     """
     modules = in_folders("beamline.features", "WORKERS")
     if "cluster" not in modules:
-        raise ConfigError("--cluster: this installation has no workers. Leave it out. Nothing was started.")
+        raise ConfigError("--cluster: the cluster feature is not installed. Leave it out. Nothing was started.")
     return import_module(modules["cluster"])

@@ -211,7 +211,8 @@ _COMPARED = ("fbp", "fista-tv")  # that show cracks, by edges and by flat parts
 
 
 def hiding_warning(made: Reconstruction, structure: Unexplained) -> str:
-    """The warning that the residual of a volume has structure; empty if it has none, or if the volume was not fitted."""
+    """The warning that the residual of a volume has structure; empty if it has none, or if the volume was not
+    fitted."""
     if structure.share <= UNEXPLAINED_LIMIT or by_name(made.method).traits.direct:
         return ""
     others = " and ".join(name for name in _COMPARED if name != made.method)

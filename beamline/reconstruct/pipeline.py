@@ -72,7 +72,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 follower.draw_slices()
             else:
                 n = follower.n_views_taken
-                channels.warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
+                channels.warn(
+                    f"Stopped while the scan was running: the volume is reconstructed from the first {count(n, 'view')}."
+                )
             prepared = follower.prepared()
 
         def facts() -> ScanFacts:
@@ -138,7 +140,7 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
             return True
         if should_stop() and not follower.source.finished:
             if not follower.has_volume:
-                raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
+                raise KeyboardInterrupt("stopped before there were enough views for a volume; nothing was written")
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
@@ -209,7 +211,7 @@ def _for_method(
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
-            "The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs."
+            "The volume fits into memory and is reconstructed without --cluster; a smaller --memory would make slabs."
         )
     if options.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")

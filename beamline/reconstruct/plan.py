@@ -238,7 +238,9 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
-    warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
+    warn(
+        f"The file does not state the times of the views. They are assumed evenly spaced, {period} s apart, in the file's order."
+    )
     return np.asarray(view_ids * float(period), np.float64)
 
 
@@ -313,4 +315,6 @@ def _check_device(device: str) -> None:
 def _require_hdf5(target: OutputPaths) -> None:
     """Raises ConfigError for a file that holds one volume."""
     if target.written and target.output.suffix.lower() not in SUFFIXES:
-        raise ConfigError(f"-o {target.output}: several volumes go into HDF5 files; give a name that ends in .h5.")
+        raise ConfigError(
+            f"-o {target.output}: several volumes can only be written to HDF5; give a name that ends in .h5."
+        )

@@ -111,7 +111,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
     slices = (rows.stop - rows.start) // side
     if end > slices:
-        raise ConfigError(f"--roi {region}: slices {first}:{end} do not lie in the volume's 0:{slices}.")
+        raise ConfigError(f"--roi {region}: slices {first}:{end} are out of range: the volume has slices 0:{slices}.")
     if region.requested:
         _refuse_beyond(region, _widest(source, selection), "the widest volume's")
     low, high = max(first - halo, 0), min(end + halo, slices)
@@ -207,7 +207,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     there = np.flatnonzero(matter.any(axis=2).mean(axis=0) >= _SEEN)
     if not there.size:
         raise DataError(
-            f"{source.path}: --roi auto finds no matter that rises from the noise in {len(data)} views. Give the box, "
+            f"{source.path}: --roi auto finds no matter above the noise in {len(data)} views. Give the box, "
             "or leave it out. Nothing was written."
         )
     hull = _hull(matter[:, there], geometry, grid, coarse)

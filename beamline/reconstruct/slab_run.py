@@ -152,7 +152,7 @@ class _SlabJob:
             partial = create_partial(path, record, self.slabs, made_from, kept)
             partial.add(n, slab.volume.data)
             return partial, list(numbers[at + 1 :])
-        raise DataError("The views are zero everywhere: there is nothing in the beam.")
+        raise DataError("The views are zero everywhere: there is no sample in the beam.")
 
     def made(
         self, n: int, by: RunMethod, decide: Decisions, done: int, *, first: bool

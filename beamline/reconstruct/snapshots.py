@@ -90,7 +90,7 @@ class Snapshots:
             self._write_picture()
         except DataError as error:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
-            self._warn(f"A snapshot was left out: {error}")
+            self._warn(f"A snapshot could not be written: {error}")
             return
         now = self._clock.now()
         written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
@@ -104,7 +104,7 @@ class Snapshots:
         try:
             self._write_picture()
         except DataError as error:
-            self._warn(f"A picture was left out: {error}")
+            self._warn(f"A picture could not be written: {error}")
             return
         self._sink(SlicesDrawn(self.picture_path, n_views, math.degrees(slices.covered), time=self._clock.now()))
 

@@ -56,7 +56,8 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that recommends an order of views with a better live volume before the end; empty if the plan has it."""
+    """A sentence that recommends an order of views with a better live volume before the end; empty if the plan has
+    it."""
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:
         return ()

@@ -221,7 +221,8 @@ def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> 
 
 
 def other_devices(runs: Path, ready: ReadyScan) -> list[str]:
-    """One sentence for each device that differs from the one that the newest run in this folder found at the same port."""
+    """One sentence for each device that differs from the one that the newest run in this folder found at the same
+    port."""
     differing: list[str] = []
     with suppress(DataError, *hdf5.ALTERED):  # a run that cannot be read says nothing of today's devices
         files = sorted(runs.glob(f"*/{SCAN}"), key=lambda path: path.stat().st_mtime)

@@ -44,7 +44,8 @@ NEXT: Mapping[State, frozenset[State]] = {
 
 
 class StateMachine:
-    """The state machine of one scan; `state` is the current state. Changes are sent to the sink as the event `state`."""
+    """The state machine of one scan; `state` is the current state. Changes are sent to the sink as the event
+    `state`."""
 
     def __init__(self, sink: Sink = lambda event: None, state: State = State.IDLE) -> None:
         self._sink, self.state = sink, state

@@ -36,7 +36,8 @@ def is_zarr(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """A scale of a volume: an array [..., z, y, x] of a Zarr store whose leading axes have length one (`VolumeScale`)."""
+    """A scale of a volume: an array [..., z, y, x] of a Zarr store whose leading axes have length one
+    (`VolumeScale`)."""
 
     path: Path
     array: Any

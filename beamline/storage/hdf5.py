@@ -359,7 +359,8 @@ def text_of(item: h5py.Dataset) -> str:
 
 
 def is_foreign(item: h5py.Dataset) -> bool:
-    """Whether a text is behind a link to a file without images: no scan needs it, and a reader would print its content."""
+    """Whether a text is behind a link to a file without images: no scan needs it, and a reader would print its
+    content."""
     if item.dtype.kind in "uifb":
         return False
     if item.is_virtual:
@@ -373,7 +374,8 @@ def is_foreign(item: h5py.Dataset) -> bool:
 
 
 def file_of(item: h5py.Dataset) -> str:
-    """The file that contains the values of a dataset: another one behind a link, or that of the first virtual source."""
+    """The file that contains the values of a dataset: another one behind a link, or that of the first virtual
+    source."""
     sources = (source.file_name for source in item.virtual_sources()) if item.is_virtual else ()
     return next((name for name in sources if name != "."), str(item.file.filename))
 

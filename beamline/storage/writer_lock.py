@@ -161,7 +161,8 @@ def held(path: Path) -> bool:
 
 
 def abandoned(path: Path) -> bool:
-    """Whether no program seems to write the file: it has not changed for QUIET s, and no running program has it open."""
+    """Whether no program seems to write the file: it has not changed for QUIET s, and no running program has it
+    open."""
     return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
 

@@ -50,7 +50,8 @@ def box_of(text: str) -> Box:
 
 
 def angles_of(text: str) -> NDArray[np.float64]:
-    """Parse FIRST:END:STEP or angles separated by commas, in degrees, to radians. Raises ValueError for any other text."""
+    """Parse FIRST:END:STEP or angles separated by commas, in degrees, to radians. Raises ValueError for any other
+    text."""
     try:
         first, *rest = (float(part) for part in text.split(":"))
         if len(rest) == 2 and rest[1] and 0 < (n := math.ceil((rest[0] - first) / rest[1] - 1e-9)) <= _MOST_VIEWS:

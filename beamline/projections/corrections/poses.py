@@ -189,7 +189,7 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> G
 
     assert table.vectors is not None
     if selection.axis_col is not None:
-        raise ConfigError(f"--axis: the vectors of {table.path} state where the axis falls. Leave it out.")
+        raise ConfigError(f"--axis: the vectors of {table.path} already determine the axis. Leave --axis out.")
     try:
         views = geometry_of_vectors(table.vectors, source.shape, cone=table.cone)
     except ValueError as error:

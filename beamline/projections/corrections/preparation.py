@@ -82,7 +82,7 @@ class Preparation:
 
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":
-            raise ValueError("--gain is for counted photons; it does not go with --noise log.")
+            raise ValueError("--gain is for --noise counts; it has no effect with --noise log. Leave one of them out.")
 
     @property
     def uses_flags(self) -> bool:

@@ -146,7 +146,8 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
 
 
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
-    """The warning that the ring current changed between flats and views and is not corrected; "" if it did not change."""
+    """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
+    change."""
     used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
     if source.quantity != "counts" or selection.step(Preparation).by_current or (known := source.currents) is None:
         return ""

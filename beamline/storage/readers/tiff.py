@@ -102,7 +102,8 @@ def appended(tif: tifffile.TiffFile) -> bool:
 
 
 def pages_one_by_one(tif: tifffile.TiffFile) -> bool:
-    """Combine pages that were appended one at a time, each a separate image to tifffile, but all alike, into one stack."""
+    """Combine pages that were appended one at a time, each a separate image to tifffile, but all alike, into one
+    stack."""
     parts = tif.series
     alike = all(len(part.shape) == 2 and (part.shape, part.dtype) == (parts[0].shape, parts[0].dtype) for part in parts)
     return len(parts) > 1 and alike and len(parts) == len(tif.pages)

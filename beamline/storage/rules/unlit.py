@@ -86,7 +86,8 @@ class ViewLight:
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:
-    """Brightness of a view's bright part relative to the flats, corrected for the bias by noise; from images of cells."""
+    """Brightness of a view's bright part relative to the flats, corrected for the bias by noise; from images of
+    cells."""
     light = flat - dark
     lit = lit_places(light)
     if not lit.any():

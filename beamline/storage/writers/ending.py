@@ -121,7 +121,8 @@ def state_words(datasets: Mapping[str, h5py.Dataset] | h5py.File, ending: ScanEn
 
 
 def complete(file: hdf5.NewFile, ending: ScanEnding) -> None:
-    """State that a file created by `layout.create` has all frames of its scan, and how the scan ended; add /exchange."""
+    """State that a file created by `layout.create` has all frames of its scan, and how the scan ended; add
+    /exchange."""
     file[layout.COMMITTED][()] = len(file[layout.DATA])
     state_ending(file, ending)
     file[layout.FINISHED][()] = 1

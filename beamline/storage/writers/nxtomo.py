@@ -166,7 +166,8 @@ class NXtomoWriter:
 
     @property
     def committed(self) -> int:
-        """Number of frames that are complete in the file: readers see them, and they survive a crash of this process."""
+        """Number of frames that are complete in the file: readers see them, and they survive a crash of this
+        process."""
         return self._committed
 
     @property

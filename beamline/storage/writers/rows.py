@@ -165,7 +165,8 @@ class Rows:
             self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
     def add_place(self, check: int, frame: int, score: float, regions: Mapping[int, Sequence[int]]) -> None:
-        """Store the score of a flag in its frame, and its regions, in existing rows; `check`: its index in the legend."""
+        """Store the score of a flag in its frame, and its regions, in existing rows; `check`: its index in the
+        legend."""
         self._columns[SCORES][frame, check] = score
         for row, box in regions.items():
             self._columns[REGIONS][row, check] = box

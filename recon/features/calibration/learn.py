@@ -73,7 +73,8 @@ def _without_smooth(image: F32) -> F64:
 
 
 def better(one: F64, other: F64) -> bool:
-    """Whether the first deviations [view] are significantly less than the second, given the scatter from view to view."""
+    """Whether the first deviations [view] are significantly less than the second, given the scatter from view to
+    view."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
     return bool(share.mean() > _LEAST) and beyond_chance(share, _SURE)
 

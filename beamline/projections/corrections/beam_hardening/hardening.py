@@ -179,7 +179,9 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     from recon.voxels.projector import project
 
     if geometry.is_cone:
-        raise NoCurveError("that takes a parallel beam, whose views all hold the same mass: state material and beam")
+        raise NoCurveError(
+            "a fit needs a parallel beam, in which all views show the same mass: state material and beam"
+        )
     some, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
     grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
@@ -201,7 +203,7 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
                     f"{uneven:.2%}, as where a sample is denser outside"
                 )
             return curve, explained
-    raise NoCurveError(f"the curve does not settle in {_ROUNDS} rounds")
+    raise NoCurveError(f"the curve does not converge in {_ROUNDS} iterations")
 
 
 def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:

@@ -200,7 +200,9 @@ def calibrated(
             views.data, before, terms, progress, None if lit.all() else lit.astype(np.float32)
         )  # fmt: skip
     except ValueError as error:
-        raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
+        raise DataError(
+            f"{source.path}: the geometry could not be calibrated: {error}. Leave out --calibrate."
+        ) from error
     looked, middle = rows_of(source, band), (source.shape[0] - 1) / 2
     whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2

@@ -81,9 +81,9 @@ class Phase:
     def __post_init__(self) -> None:
         others = self.distance_mm, self.energy_kev, self.unsharp
         if self.material is None and any(other is not None for other in others):
-            raise ValueError("--distance-mm, --energy-kev and --unsharp are for --phase.")
+            raise ValueError("--distance-mm, --energy-kev and --unsharp need --phase.")
         if (ratio := self._ratio) is not None and not 0 <= ratio < math.inf:
-            raise ValueError(f"--phase: delta/beta is 0 or more, got {self.material}.")
+            raise ValueError(f"--phase: delta/beta must be 0 or more, got {self.material}.")
 
     @property
     def _ratio(self) -> float | None:
@@ -128,7 +128,7 @@ class Phase:
         from recon.features.phase.paganin import Paganin, length_of
 
         if source.row_pitch_mm is not None:
-            raise ConfigError(f"--phase needs square pixels; {source.path} has others.")
+            raise ConfigError(f"--phase needs square pixels; those of {source.path} are not square.")
         cone, pitch = cone_of(source, selection), pixel_size(source, selection)
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm

@@ -30,7 +30,8 @@ _DATE = 100_000  # from which a number beside that of the image is a date or a t
 
 
 def kind_of(name: str) -> FrameKind:
-    """The kind of image by a file's name relative to the scan's folder; the name itself takes precedence over folders."""
+    """The kind of image by a file's name relative to the scan's folder; the name itself takes precedence over
+    folders."""
     return _by(_REFERENCE, name)
 
 
