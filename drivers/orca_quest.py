@@ -73,7 +73,7 @@ class LightPath:
             ("transmission", 1e-6, 1.0), ("wavelength_nm", QE_NM[0], QE_NM[-1]),
         ):  # fmt: skip
             if not low <= (value := getattr(self, name)) <= high:
-                raise ValueError(f"{name} lies in {low:g} ... {high:g}, got {value:g}")
+                raise ValueError(f"{name} must lie in {low:g} ... {high:g}, got {value:g}")
 
     @property
     def collected(self) -> float:

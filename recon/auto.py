@@ -230,7 +230,7 @@ class Auto:
     def __post_init__(self) -> None:
         check_settings(self)
         if not self.candidates:
-            raise ValueError("candidates must be at least one method, got none")
+            raise ValueError("candidates must contain at least one method, got none")
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The result of the chosen method, with the reason for the choice.

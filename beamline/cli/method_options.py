@@ -175,7 +175,7 @@ _IN_TIME = together(
         "volumes",
         type=WholeRange(min=2),
         metavar="N",
-        help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
+        help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",
     ),
     run_option(
@@ -249,7 +249,7 @@ method_options = together(
     run_option(
         "--early-stop",
         is_flag=True,
-        help="End the fit when held-out views stop improving; every tenth view is held out unless --views holds out some.",
+        help="End the fit when held-out views stop improving; holds out every tenth unless --views does.",
     ),
     _FINISH,
     heading(OUTPUT),
@@ -278,8 +278,8 @@ method_options = together(
     run_option(
         "--plain-splatting",
         is_flag=True,
-        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It shows the bias that the "
-        "corrected projection does not have.",
+        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It has a bias that the "
+        "corrected projection avoids.",
     ),
     option(
         "--set",

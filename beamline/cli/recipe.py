@@ -133,8 +133,8 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: options by their long names (YAML), or a volume with its recipe. The command line "
-        "goes before it.",
+        help="Recipe: options by their long names (YAML), or a volume with its recipe. Options on the command "
+        "line override it.",
     )(command)
 
 

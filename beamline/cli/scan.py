@@ -199,7 +199,7 @@ def _refuse_contradictions(request: ScanRequest) -> None:
         raise click.UsageError("--resume continues RUN with its own configuration: leave out -o and --set.")
     if request.rehearse:
         raise click.UsageError(
-            "--rehearse starts a new run; --resume already uses the devices of RUN, simulated or real: leave out --rehearse."
+            "--rehearse starts a new run: leave it out with --resume, which uses the devices of RUN."
         )
     if request.documents is not None:
         raise click.UsageError("--documents describes complete scans: leave it out with --resume.")

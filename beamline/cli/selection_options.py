@@ -138,7 +138,7 @@ def column(value: str) -> float | None:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{value!r} is neither a column (0 is the centre of the first one) nor auto")
+        raise ValueError(f"{value!r} is neither a column number (0: centre of the first) nor auto")
     return number
 
 

@@ -128,7 +128,7 @@ def override_of(key: str, value: object) -> str:
         text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True)
     except yaml.YAMLError:
         raise ConfigError(
-            f"{key}: {value!r}; expected a number, a text, a list or a group. Nothing was started."
+            f"{key}: {value!r} is not allowed; expected a number, a text, a list or a group. Nothing was started."
         ) from None
     return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
 

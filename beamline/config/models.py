@@ -249,7 +249,7 @@ class Config(Section):
         if n > 1 and self.scan.mode is Mode.FLY:
             raise ValueError(
                 f"scan.frames_per_view {n}: each frame of a fly scan has its own angle; set scan.mode to step, or "
-                "take more views, which hold as much light"
+                "plan more views, which collect as much light"
             )
         if n > 1 and self.monitor.retake:
             raise ValueError(

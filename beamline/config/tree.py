@@ -46,7 +46,7 @@ def read(text: str, name: str) -> Tree:
     data, origins = _parsed(text, name)
     if data is None:
         raise ConfigError(
-            f"{name}: the configuration is empty; `beamline config init` prints a complete example. Nothing was started."
+            f"{name}: the file is empty; `beamline config init` prints a complete example. Nothing was started."
         )
     if not isinstance(data, dict):
         raise ConfigError(f"{name}:1: has no `key: value` lines; `beamline config init` prints a complete example.")

@@ -117,7 +117,7 @@ class ScanCorrection:
         """
         if self.photons is not None:
             raise DataError(
-                f"{self._source.path}: photons are counted, which needs all views in "
+                f"{self._source.path}: --noise counts needs all views in "
                 f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
         self._look_for_shadow(frames)

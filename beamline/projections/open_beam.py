@@ -186,7 +186,7 @@ def photons_of(
             if model.noise == "auto":
                 return None
             raise ConfigError(
-                f"--noise counts: {source.path} the counts per photon cannot be determined: {error}. Give --gain COUNTS."
+                f"--noise counts: {source.path} does not show the counts per photon: {error}. Give --gain COUNTS."
             ) from error
     # A mean of n frames has n times as many photons a count, too; flats and darks are single frames.
     photons = Photons(photons.gain / source.frames_per_view, photons.variance / source.frames_per_view)

@@ -213,7 +213,7 @@ def _corrected(
     if 2 * projections.view_ids.size < used.size:
         raise DataError(
             f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
-            "light, no finite pixel, or not the pixels that were written. These are too few to stand for the scan: choose "
+            "light, no finite pixel, or not the pixels that were written. These are too few for the scan: choose "
             "those that can be used with --views, or repeat the others."
         )
     return projections

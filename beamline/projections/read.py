@@ -85,8 +85,8 @@ def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.in
     if damaged.any():
         taken = "left out" if used else "used as they are (--flags ignore)"
         warn(
-            f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
-            f"checksums: {taken}. Look for a good copy of {source.path}."
+            f"Frames {spans(np.sort(frames[damaged]).tolist())} differ from their "
+            f"checksums: {taken}. Look for an intact copy of {source.path}."
         )
     return lost | damaged if used else lost
 

@@ -159,6 +159,6 @@ def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Valu
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
         raise DataError(
-            f"{path} is of another {of}: {listed}. Give the options that it was made with, or start anew without "
+            f"{path} belongs to another {of}: {listed}. Give the options that it was made with, or start anew without "
             "--resume. Nothing was touched."
         )

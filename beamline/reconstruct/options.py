@@ -132,7 +132,7 @@ class OutputPaths:
         """Raise DataError if slabs of an earlier call exist."""
         if os.path.lexists(self.partial):
             raise DataError(
-                f"{self.partial} exists: it keeps the slabs of a call that was stopped. Go on from it with --resume "
+                f"{self.partial} exists: it has the slabs of an interrupted call. Continue it with --resume "
                 f"{self.partial}, or move it away. Nothing was touched."
             )
 

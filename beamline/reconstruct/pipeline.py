@@ -72,9 +72,7 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 follower.draw_slices()
             else:
                 n = follower.n_views_taken
-                channels.warn(
-                    f"Stopped while the scan was running: the volume is reconstructed from the first {count(n, 'view')}."
-                )
+                channels.warn(f"Stopped while the scan was running: the volume shows the first {count(n, 'view')}.")
             prepared = follower.prepared()
 
         def facts() -> ScanFacts:

@@ -238,9 +238,7 @@ def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
-    warn(
-        f"The file does not state the times of the views. They are assumed evenly spaced, {period} s apart, in the file's order."
-    )
+    warn(f"The file has no times of the views. They are assumed evenly spaced, {period} s apart, in the file's order.")
     return np.asarray(view_ids * float(period), np.float64)
 
 
@@ -285,7 +283,7 @@ def _refuse_unfollowed(options: ReconOptions) -> None:
     method, views = options.streaming, options.selection.views
     if not (views == "all" or views.startswith("every:")) or method.steps is not None:
         raise ConfigError(
-            "--follow takes views as they come, and fits for --seconds after the end: leave out --views, but for "
+            "--follow uses views as they are recorded, and fits for --seconds after the end: leave out --views, except "
             "every:K, and --steps."
         )
     try:
@@ -299,8 +297,8 @@ def _require_finished(source: ScanSource, options: ReconOptions) -> None:
     if source.finished or options.unfinished:
         return
     raise DataError(
-        f"{source.path} is not finished. {next_step(source.path)} --unfinished takes the {source.image_key.size} "
-        "frames that are there as they are. Nothing was written."
+        f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
+        "frames recorded so far. Nothing was written."
     )
 
 

@@ -182,7 +182,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
         )
     if isinstance(method, FitMethod) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty refits on voxels, and {method.name} has no finish there with --finish 0. Leave one of "
+            f"--uncertainty refits on voxels, and {method.name} with --finish 0 has no steps on voxels. Leave one of "
             "them out."
         )
 

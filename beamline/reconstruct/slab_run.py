@@ -217,7 +217,7 @@ def keeping(path: Path) -> Iterator[None]:
         if not path.is_file():
             raise
         raise ScanStopped(
-            f"The reconstruction was stopped; {path} keeps the slabs that are finished. The same call with --resume "
+            f"The reconstruction was stopped; {path} has the finished slabs. The same call with --resume "
             f"{path} makes the others."
         ) from error
     remove(path)

@@ -129,7 +129,9 @@ def verbs_taken(
     try:
         requests = _Requests(place)
     except OSError as error:
-        raise DataError(f"{place} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
+        raise DataError(
+            f"{place} cannot be created ({error.strerror}). Nothing has moved, and no frame was recorded."
+        ) from error
     thread = threading.Thread(target=take_verbs, name="control", daemon=True)
     thread.start()
     try:
@@ -194,7 +196,7 @@ def ask(run: Path, verb: Verb) -> Asked:
     try:
         folder = os.lstat(request.parent)
     except OSError:
-        raise ConfigError(f"no scan runs in {run}. Nothing was changed.") from None
+        raise ConfigError(f"no scan is running in {run}. Nothing was changed.") from None
     if sys.platform != "win32" and (fault := _not_private(folder)):
         raise ConfigError(
             f"{request.parent}: {fault}. Only the user who started a scan can control it. Nothing was changed."
@@ -204,7 +206,7 @@ def ask(run: Path, verb: Verb) -> Asked:
             os.close(os.open(request, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except OSError as error:
         raise DataError(
-            f"{run} cannot be told to {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
+            f"{run} does not accept {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."
         ) from error
     return Asked(part, verb, time.monotonic())
 

@@ -159,7 +159,7 @@ def _new_folder(config: Config, place: Path) -> Path:
 def _runs(series: Path, config: Config) -> list[Path | None]:
     """The newest run folder of each energy of a series; None: there is none."""
     if not is_series(series):
-        raise ConfigError(f"{series} is no folder of a series of energies. Nothing was changed.")
+        raise ConfigError(f"{series} is not the folder of a series of energies. Nothing was changed.")
     run_of_energy = dict[float | None, Path]()
     for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
         run_of_energy[load(run / CONFIG, environment={}).scan.energy] = run

@@ -457,7 +457,7 @@ class Exposures:
         while self._stage.moving():
             self._stop.refuse_abort()
             if self._clock.now() > deadline:
-                raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
+                raise InstrumentError(f"{self._stage.name}: it is still moving after a stop. Use its emergency stop.")
             self._clock.sleep(POLL)
 
     @property

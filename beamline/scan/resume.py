@@ -127,7 +127,7 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
-        raise ConfigError(f"{run} is no folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
+        raise ConfigError(f"{run} is not the folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
     try:
         lock = WriterLock(run / CONFIG, exclusive=True)
     except OSError as error:
@@ -151,12 +151,12 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
     for part in files:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             if layout.COMMITTED not in file:
-                raise DataError(f"{part} is no scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
+                raise DataError(f"{part} is not a scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
             for other in (config, given):
                 if other is not None:
                     require_same_config(run, file["/entry/record/config"].asstr()[()], other)
             if not (angles := views_planned(file)):
-                raise DataError(f"{part} does not hold its plan: its views are not known. {_UNTOUCHED}")
+                raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
                 parts.append(part)
@@ -164,7 +164,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 views |= views_in(file)
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
-        raise NoFrame(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
+        raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     end_references = None
     if len(views) >= planned:
         with ExitStack() as opened:
@@ -264,7 +264,7 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     """
     files, left_out = _files(run)
     if not files:
-        raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
+        raise DataError(f"{run} is not the folder of a run: it has no {SCAN}. {_UNTOUCHED}")
     done = [recover(part, say) for part in files]
     if len(parts := [one.path for one in done if one.frames]) > 1:
         changed = not is_joined(run / JOINED)

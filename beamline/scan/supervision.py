@@ -282,7 +282,7 @@ class BeamLog:
         if self._failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
-        self._sink(Warned(f"{problem} The scan goes on without readings until it answers again."))
+        self._sink(Warned(f"{problem} The scan continues without readings until the monitor answers again."))
 
 
 def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink, pause: PauseRequest) -> BeamLog:

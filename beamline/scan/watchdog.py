@@ -103,7 +103,7 @@ class _Keeper:
         while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
             self._process.beat()
         if not self._ready.is_set() or not self._process.running:
-            self._warn("The watchdog does not run: a scan that is killed leaves the shutter open.")
+            self._warn("The watchdog is not running: if the scan is killed, the shutter stays open.")
         self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
         self._thread.start()
 

@@ -90,7 +90,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except Exception as error:  # readers of foreign files raise various errors if one is damaged
         raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
     if not arrays:
-        raise DataError(f"{path} is no image of OME-Zarr; name an array in it, in `view` as {path.name}::NAME.")
+        raise DataError(f"{path} is not an OME-Zarr image; name an array in it, in `view` as {path.name}::NAME.")
     finest, *coarser = arrays
     if finest.ndim < 3 or any(n != 1 for n in finest.shape[:-3]) or np.dtype(finest.dtype).kind not in "uifb":
         raise DataError(

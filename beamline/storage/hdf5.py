@@ -72,7 +72,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
-        raise (NotReadyError if follow else DataError)(f"{path} is not there.")
+        raise (NotReadyError if follow else DataError)(f"{path} does not exist.")
     head = superblock(path)
     # HDF5 would wait for ever for a writer that died to mend a torn block.
     if grows_here(path) or (head is not None and head.grows and abandoned(path)):
@@ -170,7 +170,7 @@ def opened_itself(path: Path) -> Iterator[None]:
     except (OSError, ValueError):  # it is gone, or was closed
         itself = False
     if not itself:
-        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself to have it read.")
+        raise DataError(f"{path} is a link, or was replaced while it was opened. Name the file itself.")
 
 
 def _apart(path: Path, follow: bool) -> h5py.File:
@@ -230,7 +230,7 @@ def readable(path: Path) -> Iterator[None]:
         limit = f"{limit} If that is too little, the file may be good." if limit and damaged(error) else ""
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
-            f"{path} is damaged, or not laid out as it should be ({type(error).__name__}: {what}). Nothing was "
+            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was "
             f"changed.{limit}"
         ) from error
 

@@ -45,7 +45,7 @@ def read_volume(
     if path.is_dir():
         return _from_folder(path), None
     if not path.is_file():
-        raise DataError(f"There is no volume {path}.")
+        raise DataError(f"{path} does not exist.")
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
         raise DataError(f"{path} holds one volume; a dataset ({dataset!r}) belongs to an HDF5 file or an .npz.")
     is_hdf5, is_numpy = h5py.is_hdf5(path), _is_numpy(path)

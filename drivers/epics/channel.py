@@ -97,7 +97,7 @@ def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> N
             device,
             f"{name} has an INVALID alarm: its IOC does not vouch for the value",
             reply=str(value),
-            advice="Look at the record in its own screen: the IOC has lost its controller, or the record was never set",
+            advice="Check the record in its control screen: the IOC lost its controller, or the record was never set",
             state=state,
         )
 

@@ -166,7 +166,7 @@ class StreamingFit:
             ValueError: there is no model yet.
         """
         if self._state is None or self._problem is None:
-            raise ValueError("there is no model yet, and nothing to compare the newest view with")
+            raise ValueError("there is no model yet that could be compared with the newest view")
         problem = self._problem
         (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
         return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale

@@ -107,7 +107,7 @@ class _Views:
             weights = weights / np.float32(usual_weight(weights, data))
         blank = kept_back[~data[kept_back].any(axis=(1, 2))]
         if blank.size:
-            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
+            raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere; choose other held-out views")
         views, start = geometry.select(used), method.gaussians
         pixel_grid = Grid.for_fit(geometry, problem.grid)
         usual = default_count(views, pixel_grid.voxel_size)

@@ -96,7 +96,7 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
     """
     n, cols = len(data), data.shape[2]
     if not 2 <= n < geometry.n_views:
-        raise ValueError(f"{n} of {geometry.n_views} views leave nothing to predict")
+        raise ValueError(f"{n} of {geometry.n_views} views leave no view to predict")
     rows = busiest_rows(data, min(max(_PIXELS // cols**2, _ROWS[0]), _ROWS[1]))
     part = np.ascontiguousarray(data[:, rows])
     planned = geometry.rows(rows.start, rows.stop)
@@ -115,7 +115,7 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
             for some, of in ((views[:n], so_far), (views, planned))
         )
         if min(fewer, all_) == 0:
-            raise ValueError("the views so far hold no matter")
+            raise ValueError("the views so far show no matter")
         return 10 * math.log10(fewer / all_)
 
     return [one() for _ in range(samples)]

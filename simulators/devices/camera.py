@@ -145,7 +145,9 @@ class SimulatedOrcaQuest:
             self._answer()
             if n_frames < 1 or self._armed_for:
                 problem = "is armed already" if self._armed_for else "cannot be armed for less than one frame"
-                raise DeviceRefused(self.name, problem, request=f"arm({n_frames})", advice="disarm() it first, n >= 1")
+                raise DeviceRefused(
+                    self.name, problem, request=f"arm({n_frames})", advice="Call disarm() first, with n >= 1"
+                )
             self._ring.clear()
             self._armed_for, self._framestamp = n_frames, 0
             self._seen, self._accepted = self._clock.now(), -np.inf
@@ -189,7 +191,7 @@ class SimulatedOrcaQuest:
                     self.name,
                     f"no frame came within {timeout:g} s; it was armed for {self._armed_for} and exposed {exposed}",
                     expected=f"a frame by {self._settings.trigger} trigger",
-                    advice="Look whether the stage moves and its trigger output is connected",
+                    advice="Check that the stage moves and its trigger output is connected",
                 )
             self._clock.sleep(due - now)
 
@@ -239,7 +241,7 @@ class SimulatedOrcaQuest:
         if self._gone and not self._ring:
             raise DeviceError(self.name, self._gone, advice="Connect it anew", state="Frames already taken are good")
         if armed and not self._armed_for:
-            raise DeviceRefused(self.name, "is not armed", advice="arm(n) it before frames are taken or triggered")
+            raise DeviceRefused(self.name, "is not armed", advice="Call arm(n) before frames are read or triggered")
 
     def _catch_up(self, now: float) -> None:
         """Look at every trigger up to `now`."""

@@ -117,7 +117,7 @@ def archive(
 def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
     """The number of frames, and the altered ones, in words, too; DataError if the scan cannot be archived."""
     if scan.exists() and not (scan.is_file() and hdf5.is_hdf5(scan)):
-        raise DataError(f"{scan} is no HDF5 scan. `beamline ingest` makes one of it. Nothing was written.")
+        raise DataError(f"{scan} is not an HDF5 scan. `beamline ingest` converts it to one. Nothing was written.")
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
         frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))

@@ -80,7 +80,12 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
 @click.command()
 @volume_argument
 @click.option(
-    "-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True, help="Its suffix names the format."
+    "-o",
+    "--output",
+    metavar="PATH",
+    callback=parsed(volume_path),
+    required=True,
+    help="Output; the suffix chooses the format.",
 )
 @click.option("--voxel", type=POSITIVE, help="Edge of a voxel, in the unit of the volume. Default: that of VOLUME.")
 @click.option(

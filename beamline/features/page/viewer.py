@@ -86,7 +86,7 @@ class _Viewer:
 
         def cuts(volumes: Sequence[ShownVolume]) -> list[VolumeTile]:
             if len({volume.shape for volume in volumes}) != 1 or len(volumes) != 2:
-                raise DataError("A difference is of two volumes of the same shape.")
+                raise DataError("A difference needs two volumes of the same shape.")
             return [volume.cut(axis, index, region, time) for volume in volumes]
 
         first, second = self._do(cuts)

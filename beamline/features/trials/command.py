@@ -106,7 +106,7 @@ class TradeoffRequest:
         "of an emission also mlem and osem.",
     )
     quick: bool = set_by(
-        "--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones."
+        "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."
     )
     seconds: float | None = set_by(equal_time)
     max_seconds: float | None = set_by(

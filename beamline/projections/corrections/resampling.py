@@ -184,8 +184,8 @@ def with_tilt(
         ) from error
     if abs(tilt) > STEEPEST:
         raise DataError(
-            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, more than the "
-            f"{math.degrees(STEEPEST):g} that are looked for. Look at the views; give the tilt with --tilt DEGREES."
+            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, beyond the "
+            f"{math.degrees(STEEPEST):g} that are searched. Check the views; give the tilt with --tilt DEGREES."
         )
     lean = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:

@@ -123,8 +123,8 @@ class Width:
                 if bent and stated.skew:
                     beam = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
                     raise ConfigError(
-                        f"--exposure-arc {self.arc}: rows with angles of their own are known of a straight parallel "
-                        f"beam only, and this is {beam}. Give the arc alone. Nothing was written."
+                        f"--exposure-arc {self.arc}: a readout arc is supported only for an untilted parallel "
+                        f"beam, and this is {beam}. Give the exposure arc alone. Nothing was written."
                     )
             elif abs(stated.arc) * reach >= _LEAST_PX:
                 motion = _Motion(stated.arc, 0.0 if bent else stated.skew)

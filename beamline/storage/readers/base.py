@@ -263,7 +263,7 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
         raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
     indices = indices.astype(np.int64)
     if indices.min() < -n or indices.max() >= n:
-        raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
+        raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{n - 1} can be read.")
     return np.where(indices < 0, indices + n, indices)
 
 

@@ -248,7 +248,9 @@ def _references(base: ScanSource, options: SourceOptions, white: float | None) -
         flats = np.full_like(nothing, white) if options.flats is None else options.flats
         return nothing if options.darks is None else options.darks, flats
     if options.darks is not None or options.flats is not None:
-        raise DataError("--quantity transmission is of frames divided by their flats: leave out --darks and --flats.")
+        raise DataError(
+            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+        )
     if base.dtype.kind != "f":
         raise DataError(
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "

@@ -151,7 +151,7 @@ def read_side_file(path: Path) -> SideFile:
         if keys.suffix == path.suffix.lower() and keys.sod in values:
             return _side_file(path, keys, values)
     known = ", ".join(f"{keys.maker} {keys.suffix}" for keys in MAKERS)
-    raise DataError(f"{path} is no file of a CT scanner that is read ({known}).")
+    raise DataError(f"{path} is not a supported file of a CT scanner ({known}).")
 
 
 def side_of(source: ScanSource) -> SideFile | None:
@@ -236,7 +236,7 @@ def _number(values: Mapping[str, str], key: str) -> float | None:
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = partial(_number, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
-        raise DataError(f"{path} says {other}: its scan is not on a circle, which is not read.")
+        raise DataError(f"{path} says {other}: only scans on a circle are supported.")
     scale = (number(keys.scale) or 1.0) if keys.scale else 1.0
     given = {name: number(getattr(keys, name)) for name in ("sod", "sdd", "pixel", "count")}
     if lacking := [getattr(keys, name) for name, value in given.items() if value is None or not value > 0]:

@@ -169,7 +169,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
         stated = unit or hdf5.attribute(item, "units")
         if stated.lower() not in hdf5.ANGLE_UNITS:
             problem = f"the units {stated!r}" if stated else "no attribute `units`"
-            raise DataError(f"{where} in {path} has {problem}: say --angles-unit deg or --angles-unit rad.")
+            raise DataError(f"{where} in {path} has {problem}: give --angles-unit deg or --angles-unit rad.")
         return hdf5.radians(item, unit)
 
 

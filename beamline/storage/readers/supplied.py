@@ -204,7 +204,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return _of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape)
     if dataset:
-        raise DataError(f"{path} is no HDF5 file, so that it has no dataset {dataset}.")
+        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
     return _of_tiffs(path)
 
 

@@ -111,7 +111,7 @@ class CroppedSource(WrappedSource):
         """
         first, end = cols
         if not 0 <= first < end <= base.shape[1]:
-            raise ConfigError(f"--cols {first}:{end} do not lie in the detector's 0:{base.shape[1]}.")
+            raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
         super().__init__(base)
         self.cols, self.shape = cols, (base.shape[0], end - first)
         self.axis_col = None if base.axis_col is None else base.axis_col - first

@@ -75,7 +75,7 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
     kind, pixels = format_of(path), pixels or Pixels()
     if record.series is not None:
         if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"volumes in time go into an HDF5 file, not into {kind.name}")
+            raise ValueError(f"a time series can only be written to HDF5, not to {kind.name}")
         write_reconstruction(path, record, replace=replace)
         return 0
     if pixels.window is not None and not kind.greys:

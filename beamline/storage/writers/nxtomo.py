@@ -66,7 +66,7 @@ def _new_file(path: Path) -> h5py.File:
             why = no_locks_sentence(path.parent, error.errno)
             raise DataError(f"{path} cannot be created: {why}. Nothing is left of it.") from error
         why = hdf5.reason(error)
-        raise DataError(f"{path} cannot be created ({why}). Is its folder there and writable?") from error
+        raise DataError(f"{path} cannot be created ({why}). Check that its folder exists and is writable.") from error
 
 
 class NXtomoWriter:

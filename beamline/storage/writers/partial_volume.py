@@ -230,7 +230,9 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 
 def _refuse_unusable(path: Path) -> None:
     if not is_partial(path):
-        raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
+        raise DataError(
+            f"{path} is not a partial volume; `beamline recon` leaves one if it is stopped after the first slab."
+        )
     if held(path):
         raise DataError(
             f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."

@@ -99,7 +99,7 @@ def learn_background(
         ValueError: fewer than 24 views.
     """
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few to hold some out; {LEAST_VIEWS} are needed")
+        raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {LEAST_VIEWS} are needed")
     total = len(TERMS) + _ROUNDS
     data = _Views.of(projections, geometry, times, measured)
     seen, unseen = data.parts()

@@ -37,7 +37,7 @@ def refuse_alike(cross_sections: F64) -> None:
     values = np.linalg.svd(cross_sections, compute_uv=False)
     if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
         raise ValueError(
-            f"views of {n} energies do not tell {materials} materials apart: give more energies, or fewer materials"
+            f"views of {n} energies cannot distinguish {materials} materials: give more energies, or fewer materials"
         )
 
 

@@ -259,7 +259,7 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     if weights is not None:
         data = np.where(weights > 0, data, np.float32(0))
     if not data.max() > 0:
-        raise ValueError("no line integral that is finite and has a weight is above 0: these views hold no matter")
+        raise ValueError("no line integral that is finite and has a weight is above 0: these views show no matter")
     return data, weights
 
 

@@ -154,14 +154,14 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device {problem.device!r} cannot be used: {error}. Give 'cpu', or 'cuda'") from error
     if geometry.width:
-        warnings.warn(f"a neural field takes rays without a width: it does not know {geometry.width}", stacklevel=2)
+        warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
     used, kept = used_and_kept_back(geometry.n_views, tuple(problem.use.held_out), method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     seen = geometry.select(used)
     grid = Grid.for_fit(geometry, problem.grid, wider=wider_than_field(data[used], seen))
     unit = density_unit(first_volume(data[used], seen, grid))
     if unit <= 0 or not (data[used] > 0).any():
-        raise ValueError("the views hold no matter: nothing absorbs. A field needs views of a sample")
+        raise ValueError("the views show no absorbing matter. A field needs views of a sample")
     edge = float(np.ptp(grid.edges, axis=0).max())
     if weights is not None:
         weights = weights / np.float32(weights[weights > 0].mean(dtype=np.float64))

@@ -60,7 +60,7 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
     assert [data["value"] for event, data in told if event == "beam"] == [1.5, 2.5, 3.5]
     warnings = [data["message"] for event, data in told if event == "warning"]
     assert len(warnings) == 4
-    assert warnings[0] == f"{SILENT} The scan goes on without readings until it answers again."
+    assert warnings[0] == f"{SILENT} The scan continues without readings until the monitor answers again."
     assert "answers again after 3 failed readings." in warnings[1]
     assert "ZeroDivisionError: a defect" in warnings[2]
     assert "after 1 failed reading." in warnings[3]

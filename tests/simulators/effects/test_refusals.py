@@ -35,9 +35,9 @@ BELOW_ONE = "must be less than 1, got"
         (
             "beam_hardening",
             {"weights": [1.0, 2.0], "energies": [20.0]},
-            "weights must be as many as energies",
+            "one weight for each energy",
         ),
-        ("beam_hardening", {"weights": [], "energies": []}, "weights must be as many as energies"),
+        ("beam_hardening", {"weights": [], "energies": []}, "one weight for each energy"),
         ("beam_hardening", {"weights": [1.0], "energies": [0.0]}, rf"energies\[0\] {POSITIVE}"),
         ("beam_hardening", {"weights": [0.0], "ratios": [1.0]}, "one of the weights must be positive"),
         ("beam_hardening", {"weights": [-1.0, 2.0], "ratios": [1.0, 2.0]}, rf"weights\[0\] {NOT_NEGATIVE}"),

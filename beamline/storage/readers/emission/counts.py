@@ -73,7 +73,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
 
 def _open(path: Path, opening: Opening) -> EmissionSource:
     if opening.follow:
-        raise DataError(f"{path} holds counts of an emission, which do not grow. Leave out --follow.")
+        raise DataError(f"{path} is an emission scan, which cannot be followed. Leave out --follow.")
     file = hdf5.open_hdf5(path)
     with hdf5.closed_on_error(file):
         return EmissionSource(path, file)

@@ -178,7 +178,7 @@ class TiffSeriesSource(ScanSource):
 
     def _require_grey(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, int]:
         if not shape or math.prod(shape) == 0:
-            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it contains no image).")
         if len(shape) != 2:
             raise DataError(f"{name} in {self.path} is {shape}; expected one grey image a file.")
         require_real(dtype, f"{name} in {self.path}")

@@ -121,7 +121,7 @@ def test_nikons_list_of_angles_goes_before_its_step(images: Path) -> None:
         ("diondo.xml", DIONDO.replace("HelixMode>false", "HelixMode>true"), "helixmode: its scan is not on a circle"),
         ("s.xml", "<a><b></a>", "cannot be read as a file of a CT scanner"),
         ("s.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines entities"),
-        ("s.log", "[System]\nuser=root\n", "no file of a CT scanner that is read"),
+        ("s.log", "[System]\nuser=root\n", "file of a CT scanner"),
     ],
 )
 def test_a_file_that_does_not_say_enough_is_refused_and_not_offered(
