@@ -62,7 +62,7 @@ def _running_in(runs: Path) -> str:
 
     names = [run.name for run in running(runs)]
     if not names:
-        return f"no scan runs in {runs}"
+        return f"no scan is running in {runs}"
     return f"{len(names)} {'scan runs' if len(names) == 1 else 'scans run'} in {runs}: {', '.join(names)}"
 
 

@@ -215,7 +215,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
     given = made.volume, method, job.prepared, job.options
 
-    why = "as they were stopped"
+    why = "their computation was stopped"
     try:
         if job.slabs:
             deviation = deviation_by_slabs(*given, job.slabs, decided.made, control, job.say)

@@ -84,7 +84,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
 
 
 def url_problem(url: str) -> str:
-    """Reason for which a URL names no process variable; "" if it names one."""
+    """Why a URL names no process variable; "" if it names one."""
     scheme, _, name = url.partition("://")
     legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
     return "" if legal else f"{url!r} names no process variable; expected pva://NAME (PVAccess) or ca://NAME"

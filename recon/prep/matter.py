@@ -116,7 +116,7 @@ def mass_attenuation(name: str, energies: ArrayLike) -> F64:
 
 
 def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float:
-    """Gray at the surface that photons of one energy enter: fluence x energy x absorption of energy.
+    """Entrance dose in gray of photons of one energy: fluence x energy x mass energy absorption.
 
     Absorbed are the energies of photoelectrons and of Compton electrons. Fluorescence counts as absorbed, which is too
     much by up to a quarter just above an edge. Inside, the dose is less by the attenuation above. xraylib's own

@@ -247,7 +247,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
 
 
 def trials_of(method: FitMethod, problem: ReconProblem, control: RunControl) -> Candidates:
-    """Residuals of views held out by a fit and by methods on voxels."""
+    """Residuals of held-out views for a fit and for methods on voxels."""
 
     def short(part: ReconProblem, watched: RunControl, of_steps: float) -> Reconstruction:
         share = part.geometry.detector_shape[0] / problem.geometry.detector_shape[0]

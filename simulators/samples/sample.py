@@ -16,7 +16,8 @@ from simulators.frame.shot import Detector, Pose
 class Sample(Protocol):
     @property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter; the blur of a turning sample is largest there."""
+        """Distance in mm from the rotation axis to the farthest matter; the blur of a turning sample is largest
+        there."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -51,7 +51,7 @@ class PieceBuilder(Protocol):
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
+        """Attenuation in 1/mm of each role, in a beam without energies."""
 
     def pieces(self) -> tuple[Piece, ...]:
         """All pieces. Raises ValueError where they cannot be placed."""
@@ -73,7 +73,9 @@ class ChangeInTime(Protocol):
     """A change of a sample with time."""
 
     def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
-        """The pieces at this time since the camera was connected. ValueError: pieces that do not change so."""
+        """The pieces at this time since the camera was connected. Raises ValueError for pieces that cannot change this
+        way.
+        """
 
 
 @dataclass(frozen=True)
